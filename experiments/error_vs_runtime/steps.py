@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import foamfit as ff
-from foamfit.solve import loop
+from foamfit.solve.compiled import loop
 from foamfit.solve.plan import plan
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

@@ -12,7 +12,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import click
 import pytest
 from click.testing import CliRunner
 
@@ -20,7 +19,8 @@ import fabricated
 from conftest import EXPERIMENTS, without_pictures
 from foamfit import api
 from foamfit.cli import main
-from foamfit.solve import along, cache, loop, precompile
+from foamfit.solve import cache, precompile
+from foamfit.solve.compiled import loop
 from foamfit.springs.compiled import bistable
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
@@ -88,26 +88,6 @@ def test_a_fit_calls_what_was_compiled_and_nothing_else(path: str, model: str) -
     assert new == []
 
 
-@pytest.mark.parametrize("name", precompile.LOOPS)
-def test_a_small_scene_calls_its_loop_with_a_derivative(
-    monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    """A model is run with a spring of each law; errors of a scene do not matter."""
-    owner, asked = {"integrate": loop, "follow": along}[name], []
-    real = getattr(owner, name)
-
-    def kept(*given: Any) -> Any:
-        asked.append((given[3].tobytes(), given[9].shape))
-        return real(*given)
-
-    monkeypatch.setattr(owner, name, kept)
-    for model in ("bistable", "microscale+microscale", "bistable+microscale+linear"):
-        asked.clear()
-        precompile.run(name, model)
-        assert len({row for row, _ in asked}) == len(set(model.split("+")))
-        assert {shape for _, shape in asked} == {(2, 2, 4)}  # of one spring, with a derivative
-
-
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Return what was run, in order, with an empty cache."""
@@ -115,24 +95,6 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     monkeypatch.setattr(precompile, "run", lambda *given: done.append(given))
     monkeypatch.setattr(cache, "compiled", lambda *_: False)
     return done
-
-
-def test_the_loops_are_compiled_once(asked: list[Any]) -> None:
-    """The body may finish as often as it likes."""
-    told: list[str] = []
-    with precompile.at_first_use("linear", 0, lambda: told.append("compiling")) as finish:
-        assert told == ["compiling"]
-        assert asked == []
-        finish()
-        finish()
-    assert asked == [("integrate", "linear"), ("follow", "linear")]
-    assert told == ["compiling"]
-
-
-def test_nothing_is_compiled_if_the_body_raises_before(asked: list[Any]) -> None:
-    with pytest.raises(click.UsageError), precompile.at_first_use():
-        raise click.UsageError("no such file")
-    assert asked == []
 
 
 def test_the_first_use_says_that_it_compiles(
@@ -147,30 +109,6 @@ def test_the_first_use_says_that_it_compiles(
         assert told.exit_code == 0, told.output
         assert ("compiling the solver" in told.stderr) == (not ready)
     assert asked == [("integrate", "bistable"), ("follow", "bistable")]
-
-
-@pytest.mark.parametrize(
-    ("model", "there", "runs"),
-    [
-        (["bistable"], (), "bistable"),
-        (["microscale"], ("integrate",), "microscale"),
-        (["bistable", "--relaxation", "1"], ("follow",), "bistable"),
-        (["auto"], (), "bistable+microscale"),
-        (["auto"], precompile.LOOPS, None),
-        (["linear+microscale"], precompile.LOOPS, None),
-    ],
-)
-def test_the_first_use_compiles_what_the_model_needs(
-    asked: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: list[str],
-    there: tuple[str, ...], runs: str | None,
-) -> None:  # fmt: skip
-    monkeypatch.setattr(cache, "compiled", lambda name="integrate": name in there)
-    monkeypatch.setattr(api, "fit", lambda *_, **__: fabricated.result())
-    without_pictures(monkeypatch)
-    args = ["fit", str(RECONSTRUCTION), "--out", str(tmp_path / "r"), "--model", *model]
-    assert CliRunner().invoke(main, args).exit_code == 0
-    missing = [loop for loop in precompile.LOOPS if loop not in there]
-    assert asked == ([] if runs is None else [(loop, runs) for loop in missing])
 
 
 def test_what_was_compiled_of_another_source_is_no_use(

@@ -1,128 +1,26 @@
-"""Springs with relaxation against a high-order integration of independent laws."""
+"""Springs with relaxation against brute-force steps, closed forms and quadrature."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import quad
 from scipy.optimize import brentq
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtri
 
 import foamfit as ff
-from reference import law
+from conftest import EXPERIMENTS
+
+sys.path.insert(0, str(EXPERIMENTS / "stability"))
+from independent import follow
 
 Terms = list[tuple[float, float]]
-
-
-@dataclass
-class Law:
-    """Independent form of the microscale law (docs/theory.md); its state is the rank w."""
-
-    k0: float
-    kc: float
-    eps_star: float
-    sigma_plus: float
-    spread_plus: float
-    sigma_minus: float
-    spread_minus: float
-
-    def ranks(self, s: float) -> tuple[float, float]:
-        if s <= 0.0:
-            return -math.inf, -math.inf
-        return (
-            math.log(s / self.sigma_plus) / self.spread_plus,
-            math.log(s / self.sigma_minus) / self.spread_minus,
-        )
-
-    def after(self, w: float, s: float) -> float:
-        plus, minus = self.ranks(s)
-        return min(max(w, plus), max(plus, minus))
-
-    def strain(self, w: float, s: float) -> float:
-        on_a, on_c = s / (self.k0 + s), self.eps_star + s / (self.kc + s)
-        return float(ndtr(-w) * on_a + ndtr(w) * on_c)
-
-    def stress(self, w: float, eps: float) -> float:
-        if eps <= 0.0:
-            return self.k0 * eps / (1 - eps)
-        high = self.k0
-        while self.strain(self.after(w, high), high) < eps:
-            high *= 2
-        return float(
-            brentq(
-                lambda s: self.strain(self.after(w, s), s) - eps, 0, high, xtol=1e-300, rtol=1e-15
-            )
-        )
-
-    def flexibility(self, s: float, held: bool, back: bool, w: float) -> float:
-        """Return dε/dσ."""
-        snapping = 0.0
-        if s <= 0.0:
-            w = -math.inf
-        elif not held:
-            spread = self.spread_minus if back else self.spread_plus
-            w = self.ranks(s)[1 if back else 0]
-            gap = self.eps_star + s / (self.kc + s) - s / (self.k0 + s)
-            snapping = gap * math.exp(-w * w / 2) / math.sqrt(2 * math.pi) / (spread * s)
-        on_a, on_c = self.k0 / (self.k0 + s) ** 2, self.kc / (self.kc + s) ** 2
-        return float(snapping + ndtr(-w) * on_a + ndtr(w) * on_c)
-
-
-def integrated(law: Law, eps: np.ndarray, t: np.ndarray, terms: Terms) -> np.ndarray:
-    """Integrate dσ/dt and dq/dt for the stress, restarting at every kink and at points between."""
-    g, tau = np.array(terms).T
-    fixed = []
-    if law.spread_minus != law.spread_plus:
-        z = math.log(law.sigma_plus / law.sigma_minus) / (law.spread_minus - law.spread_plus)
-        fixed.append(law.sigma_plus * math.exp(min(law.spread_plus * z, 700.0)))
-    for z in (-8.3, -5, -2, 0, 2, 5, 8):
-        fixed.append(law.sigma_plus * math.exp(law.spread_plus * z))
-        fixed.append(law.sigma_minus * math.exp(law.spread_minus * z))
-    w = -math.inf
-    s = law.stress(w, eps[0])
-    w, q, out = law.after(w, s), np.zeros(len(terms)), [s]
-    for (e0, e1), h in zip(itertools.pairwise(eps), np.diff(t), strict=True):
-        s1, rate, state = law.stress(w, e1), (e1 - e0) / h, w
-        kinks = list(fixed)
-        if w > -40:
-            kinks.append(law.sigma_plus * math.exp(law.spread_plus * w))
-            kinks.append(law.sigma_minus * math.exp(law.spread_minus * w))
-        inside = sorted({k for k in kinks if min(s, s1) < k < max(s, s1)}, reverse=bool(s1 < s))
-        stops = [s, *inside, s1]
-        times = [
-            0.0,
-            *((law.strain(law.after(w, k), k) - e0) / rate for k in inside),
-            h,
-        ]
-        for (a, b), (sa, sb) in zip(
-            itertools.pairwise(times), itertools.pairwise(stops), strict=True
-        ):
-            if b - a <= 1e-15 * h:
-                continue
-            middle = 0.5 * (sa + sb)
-            now = law.after(state, middle)
-            held, back = now == state, now != law.ranks(middle)[0]
-
-            def motion(
-                _: float, y: Any, held: bool = held, back: bool = back, w: float = state,
-                rate: float = rate,
-            ) -> Any:  # fmt: skip
-                ds = rate / law.flexibility(y[0], held, back, w)
-                return np.concatenate([[ds], g * ds - y[1:] / tau])
-
-            stiff = tau.min() < 0.01 * (b - a)
-            q = solve_ivp(
-                motion, (a, b), [sa, *q], method="Radau" if stiff else "DOP853",
-                rtol=1e-11 if stiff else 1e-12, atol=1e-12 * law.k0,
-            ).y[1:, -1]  # fmt: skip
-        w, s = law.after(w, s1), s1
-        out.append(s + q.sum())
-    return np.array(out)
 
 
 def loops(turns: tuple[float, ...], samples: int) -> np.ndarray:
@@ -164,35 +62,13 @@ TURNS = (0.0, 0.5, 0.2, 0.4, 0.05, 0.6, -0.02, 0.3)
 def test_stress_is_within_rtol(own: tuple[float, ...], terms: Terms, samples: int) -> None:
     eps = loops(TURNS, samples)
     t = np.linspace(0.0, 1.0, eps.size)
-    want = integrated(Law(*own), eps, t, terms)
+    spring = ff.MicroscaleSpring(*own, relaxation=terms)
+    truth = follow(chain(spring), ff.DisplacementDrive(2e-2 * eps), t)
+    assert not truth.why
+    want = truth.base_stress
     for rtol in (1e-4, 1e-6, 1e-9):
-        got = stress_of(ff.MicroscaleSpring(*own, relaxation=terms), eps, t, rtol).base_stress
+        got = stress_of(spring, eps, t, rtol).base_stress
         assert np.abs(got - want).max() <= rtol * np.ptp(want)
-
-
-def test_a_bistable_spring_relaxes_about_its_own_law() -> None:
-    """The term g (σ - σ(0) exp(-t/τ) - ∫ σ exp(-(t-u)/τ) du/τ) is evaluated by quadrature."""
-    spring = ff.BistableSpring(5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6)
-    turns = np.array([0.01, 0.4, 0.2, 0.25, 0.05, 0.2])
-    t = np.linspace(0.0, 1.0, turns.size)
-    got = stress_of(replace(spring, relaxation=[(0.6, 0.15)]), turns, t, 1e-9).base_stress
-    followed = law(spring)
-
-    def stress(at: float) -> float:
-        past = int(np.searchsorted(t, at))
-        return float(followed.stress([*turns[:past], float(np.interp(at, t, turns))])[-1])
-
-    grid = np.linspace(0.0, 1.0, 2001)
-    slopes = np.diff([stress(u) for u in grid])
-    corners = grid[1:-1][np.abs(np.diff(slopes)) > 1e-2 * np.abs(slopes).max()]
-    for j in (1, 3, 5):
-        ends = np.unique([0.0, *t[: j + 1], *(c for c in corners if c < t[j])])
-        memory = sum(
-            quad(lambda u, at=t[j]: stress(u) * math.exp((u - at) / 0.15) / 0.15, a, b)[0]
-            for a, b in itertools.pairwise(ends)
-        )
-        term = 0.6 * (stress(t[j]) - stress(0.0) * math.exp(-t[j] / 0.15) - memory)
-        assert got[j] == pytest.approx(stress(t[j]) + term, abs=2e-5 * got.max())
 
 
 def test_a_held_strain_relaxes_exponentially() -> None:

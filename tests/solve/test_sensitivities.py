@@ -180,23 +180,6 @@ def test_a_dashpot_of_zero_has_a_sensitivity() -> None:
             assert miss.max() <= 2e-3 * max(np.abs(expected).max(), 1e-300), (name, drive)
 
 
-def test_a_dashpot_of_zero_beside_what_is_stiff() -> None:
-    """The one-sided derivative at η = 0 by implicit steps, behind a light mass and a dashpot."""
-    springs = damped(PAIR, 0.0, 30.0)
-    for masses, drive in (([1e-8, 0.0], IMPACT), ([1e-8, 0.0], FEW["motion"])):
-        got, other = (
-            ff.simulate(chain(damped(springs, eta, 30.0), masses), drive, SPARSE, 1e-9,
-                        sensitivities=["s1_eta"])
-            for eta in (0.0, 1e-3)
-        )  # fmt: skip
-        assert got.method == "Radau IIA"
-        events = [*got.switches[:, 0], *([got.contact_end] if got.contact_end else [])]
-        away = (np.abs(SPARSE[:, None] - np.array([events])) > 1e-2 * SPARSE[-1]).all(axis=1)
-        expected = (other.base_stress - got.base_stress) / 1e-3
-        miss = np.abs(got.sensitivities["s1_eta"].base_stress - expected)[away]
-        assert miss.max() <= 2e-3 * np.abs(expected).max()
-
-
 def test_sensitivities_do_not_change_the_response() -> None:
     for scene, drive in STIFF.values():
         if drive is FEW["moved"]:  # slow, and another scene has a prescribed motion

@@ -25,9 +25,8 @@ from test_simulation import (
 )
 
 import foamfit as ff
-from foamfit.solve import implicit
 from foamfit.solve.plan import EXPLICIT_STEPS, RADAU, Motion, Plan, plan
-from reference import Bistable, Chain, Impact, Linear, energy_balance
+from reference import Bistable, Chain, Linear
 
 PAIRS = {"model-3": (BASE_3, TOP_3, THREE, FOAM_1), "foam-2": (BASE_2, TOP_2, TWO, FOAM_2)}
 
@@ -66,37 +65,6 @@ def struck(name: str, eta: float = 0.0, mass: float = 0.0) -> tuple[Chain, ff.Im
 # --------------------------------------------------------------------------------------- the method
 
 
-def test_order_conditions() -> None:
-    """B(2s - 1), C(s) and D(s - 1) imply order 2s - 1; the last stage is the end of the step."""
-    c, a = implicit.NODES, implicit._A
-    s, b = implicit.POINTS, a[-1]
-    assert c[-1] == 1.0
-    assert (np.diff(c) > 0.0).all()
-    for k in range(1, 2 * s):
-        assert b @ c ** (k - 1) == pytest.approx(1 / k, rel=1e-13)
-    for k in range(1, s + 1):
-        np.testing.assert_allclose(a @ c ** (k - 1), c**k / k, rtol=0, atol=1e-13)
-    for k in range(1, s):
-        np.testing.assert_allclose((b * c ** (k - 1)) @ a, b / k * (1 - c**k), atol=1e-13)
-
-
-def test_systems_and_error_of_a_step() -> None:
-    """The basis makes the inverse of A diagonal; the embedded method has order 5 and a rate more.
-
-    Its error is γ (f(0) + Σ e_i z_i/h) with 1/γ the real eigenvalue: zero to that order.
-    """
-    values = np.where(np.arange(implicit.EIGEN.size) > 0, 2.0, 1.0)  # for the conjugates
-    inverse = np.real(implicit.FROM_BASIS @ (implicit.EIGEN[:, None] * implicit.TO_BASIS))
-    np.testing.assert_allclose(inverse, np.linalg.inv(implicit._A), rtol=0, atol=1e-11)
-    identity = np.real(implicit.FROM_BASIS @ implicit.TO_BASIS)
-    np.testing.assert_allclose(identity, np.eye(implicit.POINTS), rtol=0, atol=1e-12)
-    assert abs(implicit.EIGEN[0].imag) < 1e-12
-    assert values.sum() == implicit.POINTS
-    for power in range(1, implicit.POINTS + 2):  # y = x^power, f = power x^(power - 1)
-        error = float(power == 1) + implicit.OF_ERROR @ implicit.NODES**power
-        assert (abs(error) < 1e-10) == (power <= implicit.POINTS), power
-
-
 # -------------------------------------------------------------------- against other solvers
 
 
@@ -128,7 +96,7 @@ def test_against_reference(name: str, drive: str, rtol: float, bar: float) -> No
     got = run(CHAINS[name], load, rtol)
     assert max(errors(got, want)) <= bar
     assert got.method == RADAU
-    assert len(got.switches) >= len(want.switches) - (want.contact_end is not None)
+    assert len(got.switches) >= want.switches
     if want.contact_end is not None:
         assert got.contact_end == pytest.approx(want.contact_end, rel=bar)
     assert got.steps < 3000
@@ -256,11 +224,6 @@ def test_contact_with_heavy_dashpots_ends_as_in_closed_form(eta: float) -> None:
         assert got.steps < 400
 
 
-@pytest.mark.parametrize("mass", [1e-12, 1e-10, 1e-8])
-def test_steps_are_bounded_where_a_mass_rings(mass: float) -> None:
-    assert run(*struck("foam-2", mass=mass), 1e-6).steps < 8000
-
-
 @pytest.mark.parametrize("name", PAIRS)
 def test_heavy_dashpots(name: str) -> None:
     chain, blow = struck(name, 1e8)
@@ -272,17 +235,6 @@ def test_heavy_dashpots(name: str) -> None:
     # the dashpots stop the striker before the spring forces matter
     stopping = blow.mass / AREA * sum(chain.heights) / 1e8
     assert got.displacement[-1].max() == pytest.approx(blow.velocity * stopping, rel=1e-4)
-
-
-def test_heavy_damper_on_the_mass_of_the_foam() -> None:
-    chain = Chain((damped(MODEL_1, 1e5),), (1.19e-3,), AREA, (5.56e-6,))
-    load = ff.StressDrive(history() * 3.8e6)
-    want = run(chain, load, 1e-11, implicit=False)
-    got = run(chain, load, 1e-6, implicit=None)
-    assert got.method == RADAU
-    assert got.steps < 2000
-    assert max(errors(got, want)) <= 1e-6
-    assert max(errors(run(chain, load, 1e-9), want)) <= 1e-8
 
 
 @pytest.mark.parametrize("eta", [1e-6, 1e-2, 1.0])
@@ -341,26 +293,6 @@ def test_the_bound_on_steps() -> None:
 # ----------------------------------------------------------------------------- energy and contact
 
 
-@pytest.mark.parametrize(
-    ("name", "speed"), [("model-1", 1.75), ("model-3", 2.1), ("foam-2", 4.44), ("two loops", 2.6)]
-)
-def test_energy_of_an_undamped_impact(name: str, speed: float) -> None:
-    chain = CHAINS[name]
-    time = np.linspace(0.0, 1.2e-3, 601)
-    got = run(chain, ff.Impact(7e-3, speed), 1e-9, time=time)
-    free = time > got.contact_end
-    rebound = np.polyfit(time[free], got.displacement[-1, free], 1)[0]
-    assert rebound < 0.0
-    # The last sample gives the remaining energy.
-    time = np.append(time[~free], got.contact_end * (1 - 1e-13))
-    got = run(chain, ff.Impact(7e-3, speed), 1e-9, time=time)
-    velocity = np.zeros_like(got.displacement)
-    velocity[-1] = rebound
-    energy = energy_balance(chain, Impact(7e-3, speed), got.displacement, velocity)
-    total = (energy["kinetic"] + energy["work"])[-1]
-    assert total == pytest.approx(energy["brought"][-1], rel=1e-6)
-
-
 @pytest.mark.parametrize("implicit", [True, False])
 def test_a_switch_shortly_before_the_end_of_contact_is_found(implicit: bool) -> None:
     """Whatever the steps: a gap at the base opens in the same step as a spring leaves branch c."""
@@ -369,27 +301,6 @@ def test_a_switch_shortly_before_the_end_of_contact_is_found(implicit: bool) -> 
         got = run(CHAINS["foam-2"], blow, rtol, implicit)
         assert got.switches[:, 1:4].tolist() == [[1, 0, 1], [1, 1, 2], [1, 2, 3]]
         assert got.contact_end == pytest.approx(want.contact_end, rel=100.0 * rtol)
-
-
-def test_samples_do_not_change_the_motion() -> None:
-    scene = struck("foam-2", 1e-2)
-    every = run(*scene, 1e-8)
-    some = np.arange(1, TIME.size, 7)
-    few = run(*scene, 1e-8, time=TIME[[0, *some]])
-    bar = 1e-8 * every.displacement.max()
-    np.testing.assert_allclose(few.displacement, every.displacement[:, [0, *some]], atol=bar)
-
-
-def test_a_single_sample() -> None:
-    chain = CHAINS["model-3, dashpots"]
-    for load in (ff.StressDrive([1e5]), ff.DisplacementDrive([1e-5]), ff.Impact(7e-3, 1.0)):
-        want = run(chain, load, 1e-6, implicit=False, time=np.zeros(1))
-        got = run(chain, load, 1e-6, time=np.zeros(1))
-        np.testing.assert_allclose(got.displacement, want.displacement)
-        if isinstance(load, ff.StressDrive):
-            np.testing.assert_allclose(got.base_stress, load.stress)
-        else:
-            np.testing.assert_allclose(got.base_stress, want.base_stress)
 
 
 # ------------------------------------------------------------------------------------- long chains
@@ -415,26 +326,3 @@ def test_a_long_chain_behaves_as_a_short_one(kind: str) -> None:
         found.append((got.contact_end, got.base_stress.max()))
     rel = 1e-3 if kind == "masses" else 1e-6
     assert found[1] == pytest.approx(found[0], rel=rel)
-
-
-EXTREME = [
-    ff.Impact(7e-3, 60.0),
-    ff.Impact(1e-9, 1e-3),
-    ff.StressDrive([0.0, -1e9, 0.0]),
-    ff.StressDrive([0.0, 1e12, 0.0]),
-    ff.DisplacementDrive([0.0, 1.7e-3, 0.0]),
-    ff.DisplacementDrive([0.0, -1e-3, 0.0]),
-]
-
-
-@pytest.mark.parametrize("load", EXTREME, ids=repr)
-@pytest.mark.parametrize("name", ["model-2, dashpot", "model-3, dashpot", "foam-2, mass"])
-def test_an_extreme_scene_is_finite_or_refused(name: str, load: ff.Impact) -> None:
-    time = np.array([0.0, 1e-4, 2e-4])
-    try:
-        got = run(CHAINS[name], load, 1e-6, time=time)
-    except ff.SimulationError as error:
-        assert str(error)  # noqa: PT017
-        return
-    assert np.isfinite(got.displacement).all()
-    assert np.isfinite(got.base_stress).all()

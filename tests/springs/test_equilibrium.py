@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import foamfit as ff
-import reference
 from strategies import admissible_springs
 
 AREA = 2e-5
@@ -64,19 +63,6 @@ def test_all_springs_carry_one_stress_and_fill_the_elongation(springs, turns):
         slack = 1e-9 * largest + 1e-12 * stiff
         switched = spring.branches(strain) != np.roll(spring.branches(strain), 1)
         assert np.all((np.abs(along - response.base_stress) <= slack) | switched)
-
-
-def test_against_the_independent_reference():
-    structure = chain(SOFT, FOAM, heights=[0.7e-3, 0.5e-3])
-    top = there_and_back(0.42e-3, 150)
-    time = np.arange(top.size, dtype=float)
-    load = ff.DisplacementDrive(top)
-    got, want = (
-        ff.simulate(structure, load, time),
-        reference.reference_displacement(structure, top, time),
-    )
-    scale = np.ptp(want.base_stress)
-    np.testing.assert_allclose(got.base_stress, want.base_stress, atol=1e-9 * scale)
 
 
 def test_flat_branches_are_shared_from_the_base_up():

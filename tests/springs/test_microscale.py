@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -105,14 +104,6 @@ def test_the_stress_comes_back_to_where_it_turned(spring: ff.MicroscaleSpring) -
     np.testing.assert_allclose(stress[[0, 9]], straight, rtol=3e-14)
 
 
-def test_a_test_that_snaps_little_tells_nothing_of_higher_ranks() -> None:
-    strain = walk((0.0, 0.2, 0.05, 0.15, 0.0))
-    spring = replace(SPRINGS["hard to snap"], sigma_plus=1.2e6)
-    other = replace(spring, kc=9.9e5, eps_star=0.3, sigma_minus=1e5)
-    np.testing.assert_allclose(other.stress(strain), 5e5 * strain / (1 - strain), rtol=1e-15)
-    assert set(spring.branches(strain)) == {"a"}
-
-
 @pytest.mark.parametrize("beyond", [0.0, 1e-9, 1.0])
 def test_strain_past_the_pole_is_refused(beyond: float) -> None:
     with pytest.raises(ff.SimulationError, match=r"sample 2.*1 \+ eps_star"):
@@ -135,48 +126,6 @@ def test_slope_is_that_of_the_stress(spring: ff.MicroscaleSpring) -> None:
         assert slope[-2] == pytest.approx(rough, rel=3e-3 if spring.spread_plus < 0.1 else 1e-6)
 
 
-NAMES = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
-
-
-def check_derivative(
-    spring: ff.MicroscaleSpring, name: str, history: np.ndarray, of: str, got: np.ndarray
-) -> None:
-    """Compare with a central difference of fourth order."""
-    value = getattr(spring, name)
-    size = 2e-4 * value * min(1.0, spring.spread_plus, spring.spread_minus)
-    at = [getattr(replace(spring, **{name: value + k * size}), of)(history) for k in (-2, -1, 1, 2)]
-    want = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * size)
-    # A rank is a log of stress divided by a spread, which amplifies rounding of the stress.
-    amplified = 2.0**-52 / min(1.0, spring.spread_plus, spring.spread_minus)
-    rounding = (1e-14 + amplified) * np.abs(at[0]).max() / size
-    assert np.abs(got - want).max() <= 1e-6 * np.abs(want).max() + rounding, name
-
-
-@pytest.mark.parametrize(
-    "spring", [SHOE, SPRINGS["reversible at low ranks"], SPRINGS["reversible at high ranks"]]
-)
-def test_derivatives_along_histories(spring: ff.MicroscaleSpring) -> None:
-    """By every parameter of the spring, including where the rank stays constant after a turn."""
-    strain = walk(TURNS, 7)[1:]
-    assert {"held", "snap-through", "snap-back"} <= set(spring.branches(strain).tolist())
-    stress = walk((0.0, 3e5, 2e4, 1.51e5, 5.1e4, 4e5, -1e4, 2e5), 7)[1:]
-    chain, names = ff.Chain([spring], [1.0], 1.0), [f"s1_{name}" for name in (*NAMES, "height")]
-    by, inverse = (
-        ff.simulate(chain, drive, np.arange(float(size)), sensitivities=names).sensitivities
-        for drive, size in (
-            (ff.DisplacementDrive(strain), strain.size),
-            (ff.StressDrive(stress), stress.size),
-        )
-    )
-    for name in NAMES:
-        check_derivative(spring, name, strain, "stress", by[f"s1_{name}"].base_stress)
-        check_derivative(spring, name, stress, "strain", inverse[f"s1_{name}"].displacement[0])
-    at = [spring.stress(strain * (1 + k * 1e-5)) for k in (-2, -1, 1, 2)]
-    want = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / 12e-5
-    # a larger height reduces all strains alike
-    assert np.abs(by["s1_height"].base_stress + want).max() <= 1e-6 * np.abs(want).max()
-
-
 def test_the_held_rank_at_the_end_of_its_stresses_is_held() -> None:
     """After snapping back to rank 0, a spring keeps its rank up to and including sigma_plus."""
     spring = SPRINGS["reversible at low ranks"]
@@ -186,19 +135,6 @@ def test_the_held_rank_at_the_end_of_its_stresses_is_held() -> None:
     np.testing.assert_array_equal(got.switches[:, [0, 3]], [(1.0, 7), (2.0, 8), (3.0, 6)])
     want = [strain_of(spring, 0.5, sigma) for sigma in (5e4, 1e5)]
     np.testing.assert_allclose(got.displacement[0, 2:], want, rtol=1e-15)
-
-
-def test_the_fraction_that_has_snapped_follows_its_two_laws() -> None:
-    stress = walk(TURNS, 20) * 4e5
-    plus, minus = (
-        norm.cdf(np.log(np.maximum(stress, 1e-300) / median) / spread)
-        for median, spread in ((1.3e5, 0.4), (5.5e4, 0.77))
-    )
-    expected, snapped = [], 0.0
-    for least, most in zip(plus, minus, strict=True):
-        snapped = min(max(snapped, least), max(least, most))
-        expected.append(snapped)
-    np.testing.assert_allclose(SHOE.fraction_along(stress), expected, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("spread", [1e-6, 1e-5])

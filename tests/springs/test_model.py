@@ -7,8 +7,9 @@ import pytest
 
 import foamfit as ff
 from foamfit.springs.compiled import compiled
+from foamfit.springs.laws.record import OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import OWN_ETA, OWN_HEIGHT, OWN_RELAXATION, unit_of
+from foamfit.springs.parameters import unit_of
 
 MICROSCALE = (5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77, 3.0)
 BISTABLE = (5.5e6, 82.5e6, -0.179e6, 0.14, 0.31, 14.3e6, 2.3e6, 0.0)
@@ -78,22 +79,3 @@ def test_a_number_of_terms_that_is_none_is_refused(number: object) -> None:
 def test_relaxation_that_is_no_sequence_of_pairs_is_refused(given: object) -> None:
     with pytest.raises(ff.InputError, match=r"^relaxation must be a sequence of pairs"):
         ff.MicroscaleSpring(*MICROSCALE, relaxation=given)  # type: ignore[arg-type]
-
-
-def test_eps_star_is_admissible_from_its_bound_on() -> None:
-    """At the bound, branch c touches branch a; smaller values are refused with the bound stated."""
-    bound = (np.sqrt(2.5e6) - np.sqrt(5e5)) / (np.sqrt(2.5e6) + np.sqrt(5e5))
-    parameters = {
-        "k0": 5e5,
-        "kc": 2.5e6,
-        "sigma_plus": 1e5,
-        "spread_plus": 0.4,
-        "sigma_minus": 5e4,
-        "spread_minus": 0.7,
-    }
-    spring = ff.MicroscaleSpring(**parameters, eps_star=bound + 1e-12)
-    sigma = np.geomspace(1e2, 1e9, 10001)
-    gap = spring.eps_star + sigma / (2.5e6 + sigma) - sigma / (5e5 + sigma)
-    assert 0.0 <= gap.min() < 1e-5
-    with pytest.raises(ff.InputError, match=rf"eps_star = .* at least {bound:.6g}"):
-        ff.MicroscaleSpring(**parameters, eps_star=bound - 1e-9)

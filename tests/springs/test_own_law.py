@@ -7,7 +7,6 @@ import functools
 import math
 import pickle
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from numba import njit
 from scipy.integrate import solve_ivp
 
 import foamfit as ff
-from foamfit.springs import compiled, laws
+from foamfit.springs import laws
 from foamfit.springs.law import derived_points
 from foamfit.springs.laws import Law
 
@@ -63,22 +62,6 @@ def test_the_law_follows_a_motion_as_scipy_does(bouc_wen: Law) -> None:
     np.testing.assert_allclose(got.base_stress, want, rtol=0, atol=2e-5 * want.max())
     back = spring.strain(spring.stress(strain))
     np.testing.assert_allclose(back, strain, rtol=0, atol=1e-11)
-
-
-def test_an_impact_agrees_with_scipy(bouc_wen: Law) -> None:
-    k, alpha, limit, n, _ = VALUES
-    mass, speed, time = 0.5, 2.0, np.linspace(0.0, 4e-3, 201)
-
-    def rhs(_: float, y: np.ndarray) -> list[float]:
-        w, v, z = y
-        held = (abs(z) / limit) ** n if z * v > 0 else 0.0
-        stress = alpha * k * w / HEIGHT + (1.0 - alpha) * k * z
-        return [v, -stress * AREA / mass, v / HEIGHT * (1.0 - held)]
-
-    want = solve_ivp(rhs, (0.0, time[-1]), [0.0, speed, 0.0], t_eval=time, rtol=1e-10, atol=1e-14,
-                     max_step=2e-6)  # fmt: skip
-    got = ff.simulate(chain_of(bouc_wen.make(VALUES, ())), ff.Impact(mass, speed), time)
-    np.testing.assert_allclose(got.displacement[0], want.y[0], rtol=0, atol=3e-6 * want.y[0].max())
 
 
 A, D, C, E = range(4)  # branches of the bistable law
@@ -186,21 +169,6 @@ def test_a_registered_copy_agrees_with_the_built_in_law(
             np.testing.assert_allclose(b, a, 0, bar, err_msg=f"{kind}, {name}")
 
 
-@pytest.mark.usefixtures("bouc_wen")
-def test_a_registered_copy_follows_histories_to_rounding() -> None:
-    one = ff.BistableSpring(*SEVEN)
-    ways = (0.0, 0.3, 0.1, 0.36, 0.0, 0.2)
-    strain = np.concatenate([np.linspace(*way, 41) for way in pairwise(ways)])
-    stress = one.stress(strain)
-    for internal in (0, 1):
-        other = copy_of(one, internal)
-        np.testing.assert_allclose(other.stress(strain), stress, rtol=1e-13, atol=1e-8)
-        assert (other.branches(strain) == one.branches(strain)).all()
-    other = copy_of(one)
-    np.testing.assert_allclose(other.strain(stress), strain, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(other.tangent(strain), one.tangent(strain), rtol=1e-12)
-
-
 # Weights of the central differences of order 8.
 WEIGHTS = np.array([4 / 5, -1 / 5, 4 / 105, -1 / 280])
 
@@ -268,32 +236,6 @@ def test_a_law_with_an_interior_mass_agrees_with_scipy(bouc_wen: Law) -> None:
         assert miss.max() <= 3e-6 * want.y[2].max()
 
 
-@pytest.mark.usefixtures("bouc_wen")
-def test_a_derivative_at_a_limit_of_a_law_is_one_sided() -> None:
-    """Δσ must not be positive, so only one side of 0 is admissible."""
-    spring = ff.BistableSpring(5.5e6, 82.5e6, 0.0, 0.14, 0.31, 14.3e6, 2.34e6)
-    time = np.linspace(0.0, 1.0, 81)
-    drive = ff.DisplacementDrive(4e-4 * np.sin(np.pi * time) ** 2)
-    one, other = (
-        ff.simulate(ff.Chain([of], [1e-3], 1e-5), drive, time, sensitivities=["s1_dsigma"])
-        .sensitivities["s1_dsigma"].base_stress
-        for of in (spring, copy_of(spring))
-    )  # fmt: skip
-    assert np.abs(one).max() > 0.5
-    np.testing.assert_allclose(other, one, rtol=0, atol=1e-3)
-
-
-def test_a_law_stands_in_a_chain(bouc_wen: Law) -> None:
-    springs = [ff.LinearSpring(4e6), bouc_wen.make(VALUES, ())]
-    time = np.linspace(0.0, 1.0, 101)
-    moved = 3e-3 * np.sin(np.pi * time)
-    got = ff.simulate(ff.Chain(springs, [4e-3, 6e-3], AREA), ff.DisplacementDrive(moved), time)
-    np.testing.assert_allclose(got.displacement[-1], moved, rtol=0, atol=1e-9)
-    own = np.diff(got.displacement, axis=0, prepend=0.0) / np.array([[4e-3], [6e-3]])
-    for spring, strain in zip(springs, own, strict=True):
-        np.testing.assert_allclose(spring.stress(strain), got.base_stress, rtol=1e-8, atol=1.0)
-
-
 def test_relaxation_begins_at_zero_at_any_strain(bouc_wen: Law) -> None:
     """q = ∫ g exp(-(t - s)/τ) dσ/ds ds from the first sample on, whatever its strain or stress."""
     g, tau, time = 0.5, 0.2, np.linspace(0.0, 1.0, 101)
@@ -308,20 +250,6 @@ def test_relaxation_begins_at_zero_at_any_strain(bouc_wen: Law) -> None:
     assert got[-1] == pytest.approx(sigma[-1] + held, rel=1e-4)
     back = ff.simulate(chain_of(spring), ff.StressDrive(got), time)
     np.testing.assert_allclose(back.strain, strain, rtol=1e-4)
-
-
-def test_the_tangent_follows_the_motion_at_a_cost_that_grows_with_its_length(
-    bouc_wen: Law,
-) -> None:
-    """Bouc-Wen loading and unloading have different slopes; n² steps would take minutes."""
-    k, alpha, limit, n, _ = VALUES
-    spring, ways = bouc_wen.make(VALUES, ()), ((0.0, 0.4), (0.4, 0.05), (0.05, 0.05), (0.05, 0.6))
-    strain = np.concatenate([np.linspace(*way, 10_000)[1:] for way in ways])
-    z = (spring.stress(strain) / k - alpha * strain) / (1.0 - alpha)
-    way = np.repeat([1.0, -1.0, -1.0, 1.0], 9_999)
-    slope = np.where(z * way > 0.0, 1.0 - np.abs(z / limit) ** n, 1.0)
-    want = alpha * k + (1.0 - alpha) * k * slope
-    np.testing.assert_allclose(spring.tangent(strain), want, rtol=1e-5)
 
 
 PLATEAU = ("loading", "plateau")
@@ -464,13 +392,6 @@ def test_a_wrong_law_gets_one_sentence(bouc_wen: Law) -> None:
         assert "\n" not in str(caught.value)
         assert law.kind in ("bistable", "bouc-wen") or law.kind not in laws.kinds()
     assert laws.law("bouc-wen") is bouc_wen
-
-
-def test_what_is_compiled_to_try_a_law_follows_its_springs(bouc_wen: Law) -> None:
-    known = laws.register(changed(bouc_wen, kind="once", spring=None))
-    before = compiled.compiled.cache_info().misses
-    known.make(VALUES, ()).stress([0.0, 0.1])
-    assert compiled.compiled.cache_info().misses == before
 
 
 @pytest.mark.parametrize(

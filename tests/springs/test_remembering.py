@@ -16,7 +16,7 @@ import pytest
 from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtr
 
 import foamfit as ff
 
@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 PLAIN = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 1.3e6, 0.4, 5.5e5, 0.6)
 WORN = replace(PLAIN, stiffening=1.6, softening=0.7, weakening=0.45)
 SPRINGS = {
+    "none": PLAIN,
     "all three": WORN,
     "no weakening": replace(WORN, weakening=0.0),
     "no softening": replace(WORN, softening=0.0),
@@ -185,38 +186,6 @@ def test_without_memory_it_is_section_6_bit_for_bit() -> None:
     once = replace(WORN, stiffening=1.0)
     assert once.strain(up) == pytest.approx(PLAIN.strain(up), rel=1e-14)
     assert once.stress(PLAIN.strain(up)) == pytest.approx(up, rel=1e-12)
-
-
-def discrete(spring: ff.MicroscaleSpring, stress: Array, count: int) -> Array:
-    """Follow `count` micro-springs, each of which records whether it has ever snapped."""
-    score = ndtri((np.arange(count) + 0.5) / count)
-    first = spring.sigma_plus * np.exp(spring.spread_plus * score)
-    again = first * math.exp(-spring.weakening)
-    back = np.minimum(spring.sigma_minus * np.exp(spring.spread_minus * score), again)
-    snapped, once, strain = np.zeros(count, bool), np.zeros(count, bool), []
-    n, soft = spring.stiffening, spring.k0 * math.exp(-spring.softening)
-    for s in stress:
-        through = s >= np.where(once, again, first)
-        snapped = (snapped | through) & ~(snapped & ~through & (s < back))
-        once |= snapped
-        k = np.where(once, soft, spring.k0)
-        on_a = 1.0 - (1.0 + n * s / k) ** (-1.0 / n)
-        strain.append(np.where(snapped, spring.eps_star + s / (spring.kc + s), on_a).mean())
-    return np.array(strain)
-
-
-@pytest.mark.parametrize("name", SPRINGS)
-def test_discrete_micro_springs_converge_to_it_as_their_number_grows(name: str) -> None:
-    spring = SPRINGS[name]
-    corners = 1e6 * np.array([0.0, 1.4, 0.3, 1.1, 0.2, 1.9, 0.0, 1.2, 0.5, 2.6, 0.4, 2.6, 3.2, 0.0])
-    stress = np.interp(np.linspace(0.0, corners.size - 1.0, 60 * corners.size),
-                       np.arange(corners.size), corners)  # fmt: skip
-    exact = spring.strain(stress)
-    counts = np.array([125, 500, 2000, 8000])
-    error = np.array([np.abs(discrete(spring, stress, c) - exact).max() for c in counts])
-    assert (error * counts < 1.0).all()  # error below the strain of one micro-spring
-    order = -np.polyfit(np.log(counts), np.log(error), 1)[0]
-    assert order == pytest.approx(1.0, abs=0.15)
 
 
 # ---------------------------------------------------------------------------------- refusals

@@ -32,8 +32,8 @@ from foamfit.fitting.curves import (
 from foamfit.solve.plan import Motion, Plan
 from foamfit.solve.plan import plan as make_plan
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
+from foamfit.springs.laws.record import MOVED
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import MOVED
 
 Places = NDArray[np.int64]
 

@@ -18,7 +18,7 @@ FOLDERS = ("springs", "solve")  # subfolders with compiled loops
 
 def _caches() -> set[Path]:
     """Return numba's cache folders of this package, one for each folder with compiled loops."""
-    from foamfit.solve import loop
+    from foamfit.solve.compiled import loop
     from foamfit.springs.compiled import bistable
 
     loops: tuple[Any, ...] = (loop.integrate, bistable.fill)

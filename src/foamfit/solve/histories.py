@@ -1,4 +1,4 @@
-"""Stress and strain of one spring along a history, without its dashpot and relaxation."""
+"""Histories that need no integration in time: of one spring, and of springs in equilibrium."""
 
 from __future__ import annotations
 
@@ -9,25 +9,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.solve import along, cache, loop, static
-from foamfit.solve.layout import Shape, lay_out
-from foamfit.solve.scene import DONE, MOTION, STRESS
+from foamfit.solve import cache
+from foamfit.solve.compiled import along, loop, static
+from foamfit.solve.compiled.layout import Shape, lay_out
+from foamfit.solve.scene import DONE, MOTION, NO_SWITCHES, STRESS
 from foamfit.springs.compiled import compiled
-from foamfit.springs.compiled.contract import INTERNAL
-from foamfit.springs.spring import Spring
+from foamfit.springs.compiled.contract import INTERNAL, Compiled
+from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, Law
 
-_ONE, _NO_LOG = np.ones(1), np.empty((0, 5))
+_ONE = np.ones(1)
 TOL = 1e-12  # of a law with internal variables
 
 
-def _given(spring: Spring, history: Array, top: int, out: Array) -> tuple[list[Any], bool]:
+def _given(law: Law, row: Array, history: Array, top: int, out: Array) -> tuple[list[Any], bool]:
     """Return the arguments that all runs have in common, and whether they integrate in time.
 
     Time is the number of the sample; it stands still for the law.
     """
-    row, integrated = spring.row.copy(), compiled(spring.law).kind == INTERNAL
+    row, integrated = row.copy(), compiled(law).kind == INTERNAL
     row[0] = 0.0  # no dashpot
-    shape = Shape((spring.law,), 0, (1,), top, b"\0", b"", False, 0, not integrated)
+    shape = Shape((law,), 0, (1,), top, b"\0", b"", False, 0, not integrated)
     layout = lay_out(shape, integrated)
     most = float(np.abs(history).max())
     scales = (most, np.abs(np.diff(history)).max(initial=0.0), most, 0.0)
@@ -39,14 +40,18 @@ def _given(spring: Spring, history: Array, top: int, out: Array) -> tuple[list[A
     return [*memory, row[None, :], _ONE, _ONE, reals, history, time, out], integrated
 
 
-def stress_along(spring: Spring, strain: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return stresses (Pa) and numbers of branches along a strain history from rest, (n,)."""
-    out, branches = np.empty((1, 2, strain.size)), np.zeros(strain.size, np.int64)
-    given, integrated = _given(spring, strain, MOTION, out)
+def stress_along(law: Law, row: Array, strain: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Return stresses (Pa) and numbers of branches along a strain history from rest, (n,).
+
+    `row` is that of a spring of the law, without relaxation.
+    """
+    out, samples = np.empty((1, 2, strain.size)), np.zeros((strain.size, 4))
+    given, integrated = _given(law, row, strain, MOTION, out)
     cache.announce(along.follow, "the laws of springs")
     if not integrated:
-        along.follow(*given, _NO_LOG, np.zeros((strain.size, 2)), branches, np.empty(strain.size))
-        return out[0, 0], branches
+        along.follow(*given, NO_SWITCHES, samples)
+        return out[0, 0], samples[:, 2].astype(np.int64)
+    branches = np.zeros(strain.size, np.int64)
     log, endings = np.empty((4 * strain.size + 64, 5)), np.empty(loop.ENDINGS)
     loop.integrate(*given, log, endings)
     for at, _, _, entered, _ in log[: int(endings[loop.SWITCHES])].tolist():
@@ -56,28 +61,28 @@ def stress_along(spring: Spring, strain: Array) -> tuple[Array, NDArray[np.int64
     return out[0, 0], branches
 
 
-def strain_along(spring: Spring, stress: Array) -> Array:
+def strain_along(law: Law, row: Array, stress: Array) -> Array:
     """Return strains along a stress history (Pa) from rest, (n,); not finite without a strain."""
     out = np.empty((1, 2, stress.size))
-    given, integrated = _given(spring, stress, STRESS, out)
+    given, integrated = _given(law, row, stress, STRESS, out)
     if not integrated:
-        strain = np.empty((1, stress.size))
-        static.balance(*given, _NO_LOG, strain, np.empty((1, stress.size), np.int64))
-        return np.asarray(strain[0])
+        history = np.empty((2, 1, stress.size))
+        static.balance(*given, NO_SWITCHES, history)
+        return np.asarray(history[0, 0])
     endings = np.empty(loop.ENDINGS)
-    loop.integrate(*given, _NO_LOG, endings)
+    loop.integrate(*given, NO_SWITCHES, endings)
     if endings[loop.OUTCOME] != DONE:
         out[0, 1, :] = np.nan
     return np.asarray(out[0, 1])
 
 
-def slope_along(spring: Spring, strain: Array) -> Array:
+def slope_along(law: Law, row: Array, strain: Array) -> Array:
     """Return slopes dσ/dε (Pa) along a strain history, (n,), each on the branch of its sample."""
-    given, integrated = _given(spring, strain, MOTION, np.empty((1, 2, strain.size)))
+    given, integrated = _given(law, row, strain, MOTION, np.empty((1, 2, strain.size)))
     if not integrated:
-        slopes, branches = np.empty(strain.size), np.empty(strain.size, np.int64)
-        along.follow(*given, _NO_LOG, np.zeros((strain.size, 2)), branches, slopes)
-        return slopes
+        samples = np.zeros((strain.size, 4))
+        along.follow(*given, NO_SWITCHES, samples)
+        return samples[:, 3]
     # Differences over the last thousandth of the way to each sample; a sample without a way has the
     # slope of the one before it.
     moves = np.diff(strain, prepend=math.nan) != 0.0
@@ -85,6 +90,77 @@ def slope_along(spring: Spring, strain: Array) -> Array:
     step = 1e-3 * np.diff(moved, prepend=0.0)
     step[step == 0.0] = 1e-9  # the first
     ways = (moved[:, None] - step[:, None] * np.array((2.0, 1.0, 0.0))).ravel()
-    stress = stress_along(spring, ways)[0].reshape(-1, 3)
+    stress = stress_along(law, row, ways)[0].reshape(-1, 3)
     found = (stress[:, 0] - 4.0 * stress[:, 1] + 3.0 * stress[:, 2]) / (2.0 * step)
     return np.asarray(found[np.cumsum(moves) - 1])
+
+
+# ---------------------------------------------------------------- scenes in closed form
+
+
+def at_samples(strain: Array, moved: bool) -> Array:
+    """Return what `along.follow` is given and fills at each sample of a motion, (n, 4).
+
+    The first two columns are the derivative by a shift of the motion in contact, if it is asked for
+    (`moved`): their product with (1, ε).
+    """
+    out = np.zeros((strain.size, 4))
+    if moved:
+        contact = (strain > 0.0).astype(float)
+        out[:, 0] = contact
+        for j in np.flatnonzero(np.diff(contact)) + 1:  # contact begins or ends before this sample
+            out[j, :2] = 0.0, 1.0 / (strain[j] - strain[j - 1]) * (contact[j] - contact[j - 1])
+    return out
+
+
+def add_dashpot(
+    out: Array, time: Array, strain: Array, eta: float, height: float, own: list[int],
+    samples: Array,
+) -> None:  # fmt: skip
+    """Add the stress of the dashpot of one spring along its motion, and its derivatives.
+
+    `own` are the second numbers of their directions; for `samples` see `at_samples`.
+    """
+    if time.size == 1 or not (eta > 0.0 or OWN_ETA in own):
+        return
+    rate = np.gradient(strain, time)
+    out[0, 0] += eta * rate
+    for p, what in enumerate(own):
+        if what == OWN_ETA:
+            out[1 + p, 0] += rate
+        elif what == OWN_HEIGHT:
+            out[1 + p, 0] -= eta * rate / height
+        elif what == MOVED:
+            shift = samples[:, 0] + samples[:, 1] * strain
+            out[1 + p, 0] += eta / height * np.gradient(shift, time)
+
+
+def on_one_plateau(
+    laws: tuple[Compiled, ...], rows: Array, branches: Array, directions: NDArray[np.int64]
+) -> Array:
+    """Mark directions of springs that were on flat branches together: either may move first.
+
+    `rows` are those of the laws, `branches` (springs, n) the numbers of the branches.
+    """
+    flat = np.zeros(branches.shape, dtype=bool)
+    for i, one in enumerate(laws):
+        first, own = one.slopes[:1], rows[i]
+        if len(one.slopes) == 3 and 0.0 in own[[*one.slopes]]:  # bistable: those of branches
+            step = one.slopes[2] - first[0]
+            flat[i] = own[first[0] + step * branches[i].astype(np.int64)] == 0.0
+    if not flat.any():
+        return np.zeros(len(directions))
+    together = (flat & (flat.sum(axis=0) > 1)).any(axis=1)
+    marked = np.isin(directions[:, 1], (0, 2, 3)) & (directions[:, 0] >= 0)  # k0, dsigma, eps_a
+    return np.where(marked, together[directions[:, 0]], 0.0)
+
+
+def switches(time: Array, history: Array) -> Array:
+    """Return the changes of branch between samples, at the later sample.
+
+    `history` (2, springs, n) are strains and branches.
+    """
+    strain, branches = history
+    at, spring = np.nonzero(np.diff(branches, axis=1).T)
+    left, entered = branches[spring, at], branches[spring, at + 1]
+    return np.column_stack([time[at + 1], spring, left, entered, strain[spring, at + 1]])

@@ -10,28 +10,26 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
-from foamfit.solve import along, cache, loop, rates, static
+from foamfit.solve import cache, histories
 from foamfit.solve import scene as scenes
-from foamfit.solve.layout import Layout, Shape, lay_out
-from foamfit.solve.run import POINTS
+from foamfit.solve.compiled import along, loop, rates, static
+from foamfit.solve.compiled.layout import Layout, Shape, lay_out
+from foamfit.solve.compiled.run import AT, POINTS
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
 from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled
 from foamfit.springs.compiled.contract import INTERNAL, TINY, Compiled
-from foamfit.springs.laws.record import Law
-from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
+from foamfit.springs.laws.record import MOVED, OWN_RELAXATION, Law
 from foamfit.springs.spring import as_samples
 
 Directions = NDArray[np.int64]
 
 FIRST_ORDER, SECOND_ORDER = "first order", "second order"
 EXPLICIT_STEPS, RADAU, AGGREGATE = "Dormand-Prince", "Radau IIA", "aggregate"
-LEAST_AGGREGATE, AS_ONE = (
-    9,
-    1e-4,
-)  # springs that an impact treats as one; error over rtol and springs
+# Springs that an impact treats as one; error over the requested error and the springs.
+LEAST_AGGREGATE, AS_ONE = 9, 1e-4
 MAX_STEPS = 2_000_000
 # Implicit steps replace explicit ones above these limits.
 MOST_RELAXATION = 3e3  # relaxation times in the duration of the scene
@@ -55,7 +53,7 @@ LOGGED = 1024  # switches in the log of a first run; with more it is repeated
 AT_MOST = 1e-9  # error of an elongation over the height
 
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
-_NOTHING, _NO_LOG = np.zeros(1), np.empty((0, 5))
+_NOTHING = np.zeros(1)
 
 
 class Laws(NamedTuple):
@@ -231,33 +229,43 @@ class Plan(NamedTuple):
     def _integrate(
         self, rows: Array, heights: Array, directions: Directions, out: Array, log: Array,
         endings: Array, reals: Array, degree: int,
-    ) -> None:  # fmt: skip
-        """Run the loop over time, with implicit steps if `degree` is that of their polynomial."""
+    ) -> Array:  # fmt: skip
+        """Run the loop over time, with implicit steps if `degree` is that of their polynomial.
+
+        Return the row of the law of the first spring as the run has left it.
+        """
         cache.announce(loop.integrate, "the solver")
         layout = self._layout(rows, directions, degree)
-        drive = self.mass, reals, self.values, self.time
-        given = *_memory(layout), rows, heights, *drive, out, log, endings
-        cache.timed(loop.integrate, *given)
+        memory, drive = _memory(layout), (self.mass, reals, self.values, self.time)
+        cache.timed(loop.integrate, *memory, rows, heights, *drive, out, log, endings)
+        return memory[2][layout.words[AT["row"]] :]
 
     def _as_one(
         self, rows: Array, heights: Array, rtol: float, drag: float, out: Array
     ) -> Motion | None:
         """Treat many springs under one stress as one spring in an impact, if that is possible."""
-        many = len(heights) >= LEAST_AGGREGATE and len(self.ends) == 1 and self.speed > 0.0
-        if not many or self.values[0] != 0.0:
+        count, one_stress = len(heights), len(self.ends) == 1 and not self.terms
+        if count < LEAST_AGGREGATE or not one_stress or self.speed == 0.0:
             return None
-        from foamfit.solve.many import integrate_aggregate, shapes_of
+        from foamfit.solve.compiled import aggregate  # which compiles it
 
-        shapes = shapes_of(self, rows)
-        if shapes is None:
+        row = aggregate.row_of(self.laws.made, rows, heights)
+        if row is None:
             return None
-        cache.announce(integrate_aggregate, "the solver of many springs")
-        log = np.empty((4 * len(rows) + 64, 5))
-        numbers = np.array((self.mass[0], drag, self.speed, AS_ONE * rtol / len(rows)))
-        given = shapes, heights, numbers, self.time, self.max_steps, out[0], log, np.zeros(2, int)
-        outcome, end, steps, switches = cache.timed(integrate_aggregate, *given)
-        endings = np.array((outcome, end, steps, switches), dtype=float)
-        return self._motion(out, AGGREGATE, endings, log, rows, 0.0)
+        law, made = aggregate.law_of(count)
+        one = self._replace(laws=Laws((law,), (made,), ()), ends=(1,), implicit=False)
+        row, height = np.concatenate(([0.0], row))[None], heights.sum(keepdims=True)
+        reals = one._reals(row, height, AS_ONE * rtol / count / self.margin, drag, 0)
+        log, endings = np.empty((4 * count + 64, 5)), np.empty(loop.ENDINGS)
+        whole = out if out.shape[1] == 2 else np.empty((1, 2, self.time.size))
+        memory = one._integrate(row, height, NO_DIRECTIONS, whole, log, endings, reals, 0)
+        out[0, 0], out[0, -1] = whole[0, 0], whole[0, 1]
+        if endings[loop.OUTCOME] == scenes.DONE:
+            end = endings.item(loop.ENDED)
+            log = aggregate.nodes_and_switches(memory, heights, log[:, 0], self.time, end, out)
+            endings[loop.SWITCHES] = len(log)
+        strongest = endings.item(loop.STRONGEST)
+        return self._motion(out, AGGREGATE, endings, log, rows, 0.0, strongest)
 
     def _brief(self, rows: Array, heights: Array, drag: float, tol: float) -> float:
         """Return the length of a short implicit step, s."""
@@ -297,27 +305,23 @@ class Plan(NamedTuple):
         count, wanted, n = len(heights), len(directions) > 0, self.time.size
         alone = self.top == scenes.MOTION and count == 1
         shown = count if everything else 1
-        out, branches = (
-            np.empty((1 + len(directions), 1 + shown, n)),
-            np.empty((count, n), np.int64),
-        )
+        out = np.empty((1 + len(directions), 1 + shown, n))
         reals = np.array((0.0, 1.0, 0.0, rtol))
-        layout = self._layout(rows, directions, integrated=False)
+        given = *_memory(self._layout(rows, directions, integrated=False)), rows, heights
         if alone:
-            strain = (self.values / heights)[None, :]
-            moved = seeds(strain[0], MOVED in directions[:, 1].tolist())
-            cache.timed(
-                along.follow, *_memory(layout), rows, heights, self.mass, reals, strain[0],
-                self.time, out, _NO_LOG, moved, branches[0], np.empty(n),
-            )  # fmt: skip
+            own = directions[:, 1].tolist()
+            strain = self.values / heights
+            samples = histories.at_samples(strain, MOVED in own)
+            drive = self.mass, reals, strain, self.time
+            cache.timed(along.follow, *given, *drive, out, NO_SWITCHES, samples)
             out[0, 1], out[1:, 1] = self.values, 0.0
-            self._add_dashpot(out, strain[0], rows[0, 0], heights.item(0), directions, moved)
+            dashpot = rows.item(0, 0), heights.item(0)
+            histories.add_dashpot(out, self.time, strain, *dashpot, own, samples)
+            history = np.stack((strain, samples[:, 2]))[:, None]
         else:
-            strain = np.empty((count, n))
-            cache.timed(
-                static.balance, *_memory(layout), rows, heights, self.mass, reals, self.values,
-                self.time, out, _NO_LOG, strain, branches,
-            )  # fmt: skip
+            history = np.empty((2, count, n))
+            drive = self.mass, reals, self.values, self.time
+            cache.timed(static.balance, *given, *drive, out, NO_SWITCHES, history)
         fine = bool(np.isfinite(out[0]).all())
         if fine and self.top == scenes.MOTION and not alone:
             miss = np.abs(out[0, -1] - self.values).max()
@@ -328,43 +332,11 @@ class Plan(NamedTuple):
             raise scenes.failure(scenes.NOT_FINITE, self.top, self.values, loose)
         slopes = Slopes(out[1:, 1:], out[1:, 0]) if wanted else None
         if slopes is not None and self.top == scenes.MOTION and count > 1:
-            slopes = slopes._replace(one_sided=self._on_one_plateau(rows, branches, directions))
-        switches = list_switches(self.time, strain, branches) if everything else NO_SWITCHES
+            rows = rows[:, 1 + 2 * self.terms :]
+            shared = histories.on_one_plateau(self.laws.made, rows, history[1], directions)
+            slopes = slopes._replace(one_sided=shared)
+        switches = histories.switches(self.time, history) if everything else NO_SWITCHES
         return Motion(out[0, 1:], out[0, 0], math.nan, switches, 0, CLOSED_FORM, slopes)
-
-    def _add_dashpot(
-        self, out: Array, strain: Array, eta: float, height: float, directions: Directions,
-        moved: Array,
-    ) -> None:  # fmt: skip
-        """Add the stress of the dashpot of one spring along its motion, and its derivatives."""
-        own = directions[:, 1].tolist()
-        if self.time.size == 1 or not (eta > 0.0 or OWN_ETA in own):
-            return
-        rate = np.gradient(strain, self.time)
-        out[0, 0] += eta * rate
-        for p, what in enumerate(own):
-            if what == OWN_ETA:
-                out[1 + p, 0] += rate
-            elif what == OWN_HEIGHT:
-                out[1 + p, 0] -= eta * rate / height
-            elif what == MOVED:
-                shift = moved[:, 0] + moved[:, 1] * strain
-                out[1 + p, 0] += eta / height * np.gradient(shift, self.time)
-
-    def _on_one_plateau(
-        self, rows: Array, branches: NDArray[np.int64], directions: Directions
-    ) -> Array:
-        """Mark directions of springs that were on flat branches together: either may move first."""
-        flat = np.zeros(branches.shape, dtype=bool)
-        for i, one in enumerate(self.laws.made):
-            first, own = one.slopes[:1], rows[i, 1 + 2 * self.terms :]
-            if len(one.slopes) == 3 and 0.0 in own[[*one.slopes]]:  # bistable: those of branches
-                flat[i] = own[first[0] + (one.slopes[2] - first[0]) * branches[i]] == 0.0
-        if not flat.any():
-            return np.zeros(len(directions))
-        together = (flat & (flat.sum(axis=0) > 1)).any(axis=1)
-        marked = np.isin(directions[:, 1], (0, 2, 3)) & (directions[:, 0] >= 0)  # k0, dsigma, eps_a
-        return np.where(marked, together[directions[:, 0]], 0.0)
 
     @property
     def _duration(self) -> float:
@@ -393,28 +365,6 @@ def _lost(endings: Array) -> float:
         share = motion / moved if moved > 0.0 else 0.0
         lost += max(share, stress / float(endings[loop.STRONGEST]))
     return lost
-
-
-def seeds(strain: Array, moved: bool) -> Array:
-    """Return the derivatives of a motion, (n, 2): seed · (1, ε) by a shift of it in contact.
-
-    `moved` is whether they are asked for.
-    """
-    out = np.zeros((strain.size, 2))
-    if not moved:
-        return out
-    contact = (strain > 0.0).astype(float)
-    out[:, 0] = contact
-    for j in np.flatnonzero(np.diff(contact)) + 1:  # contact begins or ends before this sample
-        out[j] = 0.0, 1.0 / (strain[j] - strain[j - 1]) * (contact[j] - contact[j - 1])
-    return out
-
-
-def list_switches(time: Array, strain: Array, branches: NDArray[np.int64]) -> Array:
-    """Return the changes of branch between samples, at the later sample."""
-    at, spring = np.nonzero(np.diff(branches, axis=1).T)
-    left, entered = branches[spring, at], branches[spring, at + 1]
-    return np.column_stack([time[at + 1], spring, left, entered, strain[spring, at + 1]])
 
 
 def _time(t: ArrayLike) -> Array:

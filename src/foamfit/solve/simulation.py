@@ -29,7 +29,8 @@ from foamfit.solve.plan import (
 from foamfit.solve.scene import MOTION, Slopes, difference
 from foamfit.springs.chain import Chain, ChainArrays, Drive, check_scene
 from foamfit.springs.compiled.contract import BY_STRESS
-from foamfit.springs.parameters import DRAG, OWN_HEIGHT, OWN_RELAXATION, direction
+from foamfit.springs.laws.record import DRAG, OWN_HEIGHT, OWN_RELAXATION
+from foamfit.springs.parameters import direction
 from foamfit.springs.spring import as_number
 
 _UNRESOLVED = (

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
@@ -49,14 +49,13 @@ class ChainArrays(NamedTuple):
     """A chain in the form that the solver uses.
 
     rows (n_springs, columns) are the springs (`compiled.solver_row`), padded with zeros; heights
-    (m) and masses (kg) are (n_springs,), top (1,) is the number of springs. `heavy` is whether
-    there are interior masses, `damped` whether there are dashpots.
+    (m) and masses (kg) are (n_springs,). `heavy` is whether there are interior masses, `damped`
+    whether there are dashpots.
     """
 
     rows: Array
     heights: Array
     masses: Array
-    top: NDArray[np.int64]
     heavy: bool
     damped: bool
 
@@ -151,7 +150,6 @@ class Chain:
             rows=padded([one.solver_row(room) for one in self.springs]),
             heights=np.array(self.heights),
             masses=np.array(self.masses),
-            top=np.array([len(self.springs)]),
             heavy=any(mass > 0.0 for mass in self.masses[:-1]),
             damped=any(spring.eta > 0.0 for spring in self.springs),
         )

@@ -1,8 +1,8 @@
 """Names and units of parameters, and directions of derivatives.
 
 A direction is a pair of numbers that names a parameter: the spring (0 = base) and the index of the
-parameter in its law, or one of the constants below for height, dashpot and relaxation terms; for
-the onsite damper the spring is -1.
+parameter in its law, or one of the constants of `laws.record` for height, dashpot and relaxation
+terms; for the onsite damper the spring is -1.
 """
 
 from __future__ import annotations
@@ -11,13 +11,16 @@ from collections.abc import Iterable
 
 from foamfit.errors import InputError
 from foamfit.springs import laws
-from foamfit.springs.laws.record import COMMON, ETA, Law, Param
-
-# Second number of a direction, above those of the parameters of any law (0, 1, …). The strength g_k
-# of relaxation term k = 1, 2, … is OWN_RELAXATION + 2 (k-1), its time τ_k the next number.
-OWN_ETA, OWN_HEIGHT, DRAG, OWN_RELAXATION = range(1_000_000, 1_000_004)
-# Derivative of a single spring by a shift of the prescribed motion of all samples in contact.
-MOVED = -1
+from foamfit.springs.laws.record import (
+    COMMON,
+    DRAG,
+    ETA,
+    OWN_ETA,
+    OWN_HEIGHT,
+    OWN_RELAXATION,
+    Law,
+    Param,
+)
 
 # Nuisance parameters (see `fitting.nuisance`) and their units.
 NUISANCE = {

@@ -158,8 +158,10 @@ class Spring(ABC):
         SimulationError
             If the spring cannot carry a tension: -k0 on branch a, or any on a unilateral spring.
         """
+        from foamfit.solve.histories import strain_along
+
         history = _as_history(stress, "stress")
-        strain = self._strain_along(history)
+        strain = strain_along(self.law, self.row, history)
         if not np.all(np.isfinite(strain)):
             at = _first(~np.isfinite(strain))
             raise SimulationError(
@@ -169,7 +171,9 @@ class Spring(ABC):
 
     def tangent(self, strain: ArrayLike) -> Array:
         """Return the slope dσ/dε (Pa) at each sample of a strain history, (n,)."""
-        return self._slope_along(self._along(strain)[0]).reshape(np.shape(strain))
+        from foamfit.solve.histories import slope_along
+
+        return slope_along(self.law, self.row, self._along(strain)[0]).reshape(np.shape(strain))
 
     def branches(self, strain: ArrayLike) -> NDArray[np.str_]:
         """Return the name of the branch at each sample of a strain history, (n,).
@@ -182,28 +186,12 @@ class Spring(ABC):
         names = np.array([self.law.named_branch(int(number)) for number in numbers])
         return names.reshape(np.shape(strain))
 
-    def _stress_along(self, strain: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Return stresses and branch numbers along a strain history."""
-        from foamfit.solve import histories
-
-        return histories.stress_along(self, strain)
-
-    def _strain_along(self, stress: Array) -> Array:
-        """Return strains along a stress history; not finite where no strain exists."""
-        from foamfit.solve import histories
-
-        return histories.strain_along(self, stress)
-
-    def _slope_along(self, strain: Array) -> Array:
-        """Return slopes along a strain history."""
-        from foamfit.solve import histories
-
-        return histories.slope_along(self, strain)
-
     def _along(self, strain: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
         """Return strains, stresses and branches along a strain history."""
+        from foamfit.solve.histories import stress_along
+
         history = _as_history(strain, "strain")
-        stress, branches = self._stress_along(history)
+        stress, branches = stress_along(self.law, self.row, history)
         if not np.all(np.isfinite(stress)):
             at = _first(~np.isfinite(stress))
             raise SimulationError(

@@ -31,7 +31,7 @@ from foamfit.terminal import without_ctrl_c
 # Modules that are imported by fits, by their pages, by the drawing of figures and by joint fits.
 FITS = ("foamfit.study.batch_work", "foamfit.data.csv_file", "pandas", "pint")
 PAGES = ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf", "jinja2")
-DRAWING = ("foamfit.report.result_figures", "foamfit.solve.loop", *PAGES)
+DRAWING = ("foamfit.report.result_figures", "foamfit.solve.compiled.loop", *PAGES)
 _JOINT = ("foamfit.study.joint", "foamfit.report.plots", *PAGES)
 ATTEMPTS = 2  # number of attempts of a call whose process ends
 # One thread per process, as there is one process per core.

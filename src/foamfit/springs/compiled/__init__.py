@@ -35,6 +35,10 @@ def compiled(law: Law) -> Compiled:
     given: Any = law.functions
     if isinstance(given, str):
         return built_in(given)
+    from foamfit.springs.laws.record import Functions
+
+    if not isinstance(given, Functions):
+        return given  # of a law that the solver has made
     from foamfit.springs.compiled.own import compile_law
 
     return compile_law(law)

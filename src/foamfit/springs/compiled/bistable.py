@@ -7,20 +7,12 @@ import math
 from numba import njit
 
 from foamfit.springs.compiled.contract import (
-    BRANCH,
     BY,
-    EPS,
     EXPLICIT,
-    HIGH,
-    LOW,
     MISS,
     OF_LAW,
     OPTIONS,
-    SIGMA_HIGH,
-    SIGMA_LOW,
     SLOPE,
-    SOFT,
-    TURNS,
     Compiled,
     beginning,
     evaluating,
@@ -29,7 +21,7 @@ from foamfit.springs.compiled.contract import (
     past,
     settling,
     switching,
-)  # fmt: skip
+)
 from foamfit.springs.law import admissible, derived_points
 
 # Branches; LINE and OPEN of linear springs. OPEN is that of a unilateral one out of contact.
@@ -83,7 +75,7 @@ def fill(values, row):  # type: ignore[no-untyped-def]
 
 @evaluating
 def evaluate(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
-    branch = s[BRANCH]
+    branch = s.branch
     line = past(row, TABLE + int(branch) * WIDE)
     sigma, slope = past(out, OF_LAW * count), past(out, SLOPE * count)
     factor = past(out, MISS * count)  # of the derivative by k; an explicit law has no miss
@@ -109,53 +101,53 @@ def evaluate(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
 @inner
 def _enter(row, s, branch):  # type: ignore[no-untyped-def]
     """Enter a branch."""
-    s[BRANCH] = branch
-    s[LOW], s[HIGH], s[SIGMA_LOW], s[SIGMA_HIGH] = -math.inf, math.inf, -math.inf, math.inf
+    s.branch = branch
+    s.low, s.high, s.sigma_low, s.sigma_high = -math.inf, math.inf, -math.inf, math.inf
     low = EPS_A if branch == D else EPS_C if branch == C else EPS_HAT_A
     high = EPS_HAT_C if branch == D else EPS_C if branch == E else EPS_A
     if branch != A:
-        s[LOW], s[SIGMA_LOW] = row[low], row[TO_STRESS + low]
+        s.low, s.sigma_low = row[low], row[TO_STRESS + low]
     if branch != C:
-        s[HIGH], s[SIGMA_HIGH] = row[high], row[TO_STRESS + high]
+        s.high, s.sigma_high = row[high], row[TO_STRESS + high]
 
 
 @switching
 def switch(row, s, up, out):  # type: ignore[no-untyped-def]
-    s[EPS] = s[HIGH] if up else s[LOW]
+    s.eps = s.high if up else s.low
     if up:
-        _enter(row, s, D if s[BRANCH] == A else C)
+        _enter(row, s, D if s.branch == A else C)
     else:
-        _enter(row, s, E if s[BRANCH] == C else A)
+        _enter(row, s, E if s.branch == C else A)
     return 0.0
 
 
 @beginning
 def begin(row, s):  # type: ignore[no-untyped-def]
-    s[TURNS] = 0.0
+    s.turns = 0.0
     _enter(row, s, A)
     return 0.0
 
 
 @settling
 def settle(row, s, eps):  # type: ignore[no-untyped-def]
-    s[EPS] = eps
+    s.eps = eps
     return 0.0
 
 
 @inverting
 def strain(row, s, sigma):  # type: ignore[no-untyped-def]
-    branch = s[BRANCH]
+    branch = s.branch
     line = past(row, TABLE + int(branch) * WIDE)
     k, origin = line[0], line[1]
     if branch == A or branch == C:
         if not sigma > -k:
-            s[SOFT] = 0.0
+            s.soft = 0.0
             return -math.inf
         per = 1.0 / (k + sigma)
-        s[SOFT] = k * per * per
+        s.soft = k * per * per
         return origin + sigma * per
-    s[SOFT] = 1.0 / k if k > 0.0 else math.inf
-    return origin + (sigma - line[2]) / k if k > 0.0 else s[LOW]
+    s.soft = 1.0 / k if k > 0.0 else math.inf
+    return origin + (sigma - line[2]) / k if k > 0.0 else s.low
 
 
 COMPILED = Compiled(
@@ -189,7 +181,7 @@ def fill_unilateral(values, row):  # type: ignore[no-untyped-def]
 
 @evaluating
 def evaluate_linear(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
-    touches = 1.0 if s[BRANCH] == LINE else 0.0
+    touches = 1.0 if s.branch == LINE else 0.0
     for j in range(count):
         out[OF_LAW * count + j], out[SLOPE * count + j] = (
             touches * row[0] * eps[j],
@@ -202,35 +194,35 @@ def evaluate_linear(row, s, eps, x, count, want, out):  # type: ignore[no-untype
 @inner
 def _enter_line(row, s, branch):  # type: ignore[no-untyped-def]
     """Enter a branch of a linear spring."""
-    s[BRANCH], s[LOW], s[SIGMA_LOW], s[HIGH], s[SIGMA_HIGH] = (
+    s.branch, s.low, s.sigma_low, s.high, s.sigma_high = (
         branch, -math.inf, -math.inf, math.inf, math.inf,
     )  # fmt: skip
     if branch == OPEN:
-        s[HIGH], s[SIGMA_HIGH], s[SIGMA_LOW] = 0.0, 0.0, 0.0
+        s.high, s.sigma_high, s.sigma_low = 0.0, 0.0, 0.0
     elif row[1] > 0.0:
-        s[LOW], s[SIGMA_LOW] = 0.0, 0.0
+        s.low, s.sigma_low = 0.0, 0.0
 
 
 @switching
 def switch_linear(row, s, up, out):  # type: ignore[no-untyped-def]
-    s[EPS] = 0.0
+    s.eps = 0.0
     _enter_line(row, s, LINE if up else OPEN)
     return 0.0
 
 
 @beginning
 def begin_linear(row, s):  # type: ignore[no-untyped-def]
-    s[TURNS] = 0.0
+    s.turns = 0.0
     _enter_line(row, s, LINE)
     return 0.0
 
 
 @inverting
 def strain_linear(row, s, sigma):  # type: ignore[no-untyped-def]
-    if s[BRANCH] == OPEN:
-        s[SOFT] = math.inf
+    if s.branch == OPEN:
+        s.soft = math.inf
         return 0.0 if sigma >= 0.0 else -math.inf
-    s[SOFT] = 1.0 / row[0]
+    s.soft = 1.0 / row[0]
     return sigma / row[0]
 
 

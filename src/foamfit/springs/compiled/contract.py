@@ -1,8 +1,9 @@
 """The contract of a law: compiled functions that the solvers call by their addresses.
 
-The solvers are compiled once for all laws, and a law is compiled alone. A spring is a block of
+The solvers are compiled once for all laws, and a law is compiled alone. A spring `s` is a block of
 numbers: its memory, which only its law changes; its present values; the results of its law; and its
-row, the constants that `fill` computes from its parameters.
+row, the constants that `fill` computes from its parameters. Most have names (`s.eps`, see
+SPRING_FIELDS); internal variables x begin at s[X].
 
     fill(values, row) -> bool
         Write the row of the law's parameters; return false if they are not admissible.
@@ -14,15 +15,15 @@ row, the constants that `fill` computes from its parameters.
         two held numbers in BY_HELD and by parameter c in BY + c. x are internal variables.
     switch(row, s, up, out)
         Leave the branch at its upper (up = 1) or lower (0) end, or at a turning point, and enter
-        the next. At an end, EPS and X become those of the end. A BY_STRESS law fills in `out`, for
+        the next. At an end, s.eps and x become those of the end. A BY_STRESS law fills `out`, for
         each held number, its derivatives by the stress, by both held numbers before, and by the
         parameters; an INTERNAL one, for each internal variable, its derivatives by ε, by all
         internal variables before, and by the parameters, and then those of the strain at the end (1
         and zeros at a turning point).
     settle(row, s, eps)
-        Bring a spring to a strain on its branch: fill EPS, X and SLOPE.
+        Bring a spring to a strain on its branch: fill s.eps and x.
     strain(row, s, sigma) -> ε
-        Return the strain at a stress on the branch, and its derivative in SOFT.
+        Return the strain at a stress on the branch, and its derivative in s.soft.
 
 There are three kinds of law. Of an EXPLICIT one the stress is a function of the strain. A BY_STRESS
 one gives the strain as a function of the stress, which is then its internal variable x; `evaluate`
@@ -36,31 +37,41 @@ derivatives of σ, V, A and B by ε, dε/dt, x and the parameters (see `Layout`)
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from inspect import Parameter, Signature
 from typing import Any, NamedTuple
 
 from llvmlite import ir
 from numba import cfunc, njit, types
-from numba.extending import intrinsic
+from numba.core.imputils import lower_setattr_generic
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import infer_getattr, intrinsic, lower_getattr_generic, models, register_model
 
-# Memory: branch; strains and stresses at its ends; 1 (-1) if it ends where the strain stops rising
-# (falling). From HELD on two held numbers, then what the law keeps.
-BRANCH, LOW, HIGH, SIGMA_LOW, SIGMA_HIGH, TURNS, HELD, OWN, MEMORY = 0, 1, 2, 3, 4, 5, 6, 8, 48
-# Values: strain and its rate, stress T with relaxation but without dashpot, the part of dT/dt
-# without dε/dt, strain and rate at the start of a step, height, dashpot, 1 + Σ g, 1/height, dε/dσ,
-# dσ/dε along the path of the internal variables, Σ g z, dσ/dε of the derivatives, dashpot and ∂V by
-# the strain rate, and 1 if V depends on that rate, which `begin` sets.
-EPS, RATE, TOTAL, DRIFT, OLD_EPS, OLD_RATE, HEIGHT, ETA, GAIN, PER_HEIGHT, SOFT, TANGENT = range(
-    MEMORY, MEMORY + 12
-)
-OFFSET, STEEP, LOSS, LOSSY = range(MEMORY + 12, MEMORY + 16)
-# Dashpot of a law with V that has none: it counts as damped.
-TINY = 1e-300
+HELD, OWN, MEMORY = 6, 8, 48  # memory: on two held numbers, then what the law keeps
 X, MOST_INTERNAL = 64, 32  # internal variables
 RELAX, MOST_TERMS = 96, 10  # g and τ of relaxation terms
-MIDWAY = RELAX + 2 * MOST_TERMS  # strain rate about the middle of a step
 RESULTS = 128  # of `evaluate`
 OF_LAW, SLOPE, MISS, BY_HELD, BY = 0, 1, 2, 3, 5
-OF_STRESS, OF_HELD, OF_PARAMETER = 0, 1, 3  # columns of CHANGES
+# What a spring remembers: branch; strains and stresses at its ends; 1 (-1) if it ends where the
+# strain stops rising (falling). Its present values: strain and its rate, stress T with relaxation
+# but without dashpot, the part of dT/dt without dε/dt, strain and rate at the start of a step,
+# height, dashpot, 1 + Σ g, 1/height, dε/dσ, dσ/dε along the path of the internal variables, Σ g z,
+# dσ/dε of the derivatives, dashpot and ∂V by the strain rate, 1 if V depends on that rate, which
+# `begin` sets. Then the first internal variable, the strain rate about the middle of a step, and
+# the first results.
+SPRING_FIELDS = (
+    ("branch", "low", "high", "sigma_low", "sigma_high", "turns"),
+    (
+        "eps", "rate", "total", "drift", "old_eps", "old_rate", "height", "eta", "gain",
+        "per_height", "soft", "tangent", "offset", "steep", "loss", "lossy", "x",
+    ),
+    ("midway",),
+    ("sigma", "slope", "miss"),
+)  # fmt: skip
+_FIRST = (0, MEMORY, RELAX + 2 * MOST_TERMS, RESULTS)
+EPS = MEMORY  # where the strain lies
+TINY = 1e-300  # dashpot of a law with V that has none: it counts as damped
+OF_STRESS, OF_HELD, OF_PARAMETER = 0, 1, 3  # columns of the derivatives of `switch`
 EXPLICIT, BY_STRESS, INTERNAL = range(3)
 
 # The layout of the derivatives is in `results_of` and in the solvers.
@@ -74,13 +85,66 @@ outer = njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
 
 REAL, WHOLE = types.float64, types.int64
 REALS_AT, WHOLES_AT = types.CPointer(REAL), types.CPointer(WHOLE)
-evaluating = cfunc(
-    REAL(REALS_AT, REALS_AT, REALS_AT, REALS_AT, WHOLE, WHOLE, REALS_AT), **OPTIONS, cache=True
+
+
+class Named(types.CPointer):  # type: ignore[misc]
+    """A pointer to numbers some of which have a name: `s.eps` is `s[EPS]`."""
+
+    def __init__(self, name: str, kind: Any, places: Mapping[str, int]) -> None:
+        """Give the names of numbers with their places."""
+        super().__init__(kind)
+        self.name, self.places = f"foamfit.{name}", dict(places)
+
+    @property
+    def key(self) -> str:
+        """What tells it from other types."""
+        return self.name
+
+
+register_model(Named)(models.PointerModel)
+
+
+@infer_getattr
+class _Names(AttributeTemplate):  # type: ignore[misc]
+    """Types of the named numbers."""
+
+    key = Named
+
+    def generic_resolve(self, pointer: Any, name: str) -> Any:
+        """Return the type of a number, or None if there is none of this name."""
+        return pointer.dtype if name in pointer.places else None
+
+
+def _place(builder: Any, kind: Any, pointer: Any, name: str) -> Any:
+    return builder.gep(pointer, [ir.Constant(ir.IntType(64), kind.places[name])])
+
+
+@lower_getattr_generic(Named)
+def _load(context, builder, kind, pointer, name):  # type: ignore[no-untyped-def]
+    return builder.load(_place(builder, kind, pointer, name))
+
+
+@lower_setattr_generic(Named)
+def _store(context, builder, signature, args, name):  # type: ignore[no-untyped-def]
+    return builder.store(args[1], _place(builder, signature.args[0], args[0], name))
+
+
+SPRING = Named(
+    "Spring",
+    REAL,
+    {
+        name: first + k
+        for first, names in zip(_FIRST, SPRING_FIELDS, strict=True)
+        for k, name in enumerate(names)
+    },
 )
-switching = cfunc(REAL(REALS_AT, REALS_AT, WHOLE, REALS_AT), **OPTIONS, cache=True)
-beginning = cfunc(REAL(REALS_AT, REALS_AT), **OPTIONS, cache=True)
-settling = cfunc(REAL(REALS_AT, REALS_AT, REAL), **OPTIONS, cache=True)
-inverting = cfunc(REAL(REALS_AT, REALS_AT, REAL), **OPTIONS, cache=True)
+evaluating = cfunc(
+    REAL(REALS_AT, SPRING, REALS_AT, REALS_AT, WHOLE, WHOLE, REALS_AT), **OPTIONS, cache=True
+)
+switching = cfunc(REAL(REALS_AT, SPRING, WHOLE, REALS_AT), **OPTIONS, cache=True)
+beginning = cfunc(REAL(REALS_AT, SPRING), **OPTIONS, cache=True)
+settling = cfunc(REAL(REALS_AT, SPRING, REAL), **OPTIONS, cache=True)
+inverting = cfunc(REAL(REALS_AT, SPRING, REAL), **OPTIONS, cache=True)
 
 
 class Compiled(NamedTuple):
@@ -98,7 +162,7 @@ class Compiled(NamedTuple):
     damps: bool = False  #: whether V depends on the strain rate
 
 
-BEGIN, EVALUATE, SWITCH, SETTLE, STRAIN = range(5)
+EVALUATE = 1  #: place among the addresses
 
 
 def results_of(parameters: int, internal: int) -> int:
@@ -124,7 +188,7 @@ def past(typing, pointer, count):  # type: ignore[no-untyped-def]
     def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
         return builder.gep(args[0], [args[1]])
 
-    return pointer(pointer, WHOLE), emit
+    return types.CPointer(pointer.dtype)(pointer, WHOLE), emit
 
 
 @intrinsic
@@ -137,20 +201,21 @@ def address(typing, pointer):  # type: ignore[no-untyped-def]
     return WHOLE(pointer), emit
 
 
-def _pointer(kind: Any, width: Any) -> Any:
+def pointing(kind: Any) -> Any:
+    """Return a function that turns a pointer, or an address, into a pointer of this type."""
+
     @intrinsic
-    def at(typing, number):  # type: ignore[no-untyped-def]
+    def turn(typing, given):  # type: ignore[no-untyped-def]
         def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
-            return builder.inttoptr(args[0], width.as_pointer())
+            turned = builder.inttoptr if given == WHOLE else builder.bitcast
+            return turned(args[0], context.get_value_type(kind))
 
-        return types.CPointer(kind)(WHOLE), emit
+        return kind(given), emit
 
-    return at
+    return turn
 
 
-_COMPLEX = ir.LiteralStructType([ir.DoubleType(), ir.DoubleType()])
-floats_at, integers_at = _pointer(REAL, ir.DoubleType()), _pointer(WHOLE, ir.IntType(64))
-complexes_at = _pointer(types.complex128, _COMPLEX)
+complexes_at, as_spring = pointing(types.CPointer(types.complex128)), pointing(SPRING)
 
 
 def by_address(context, builder, signature, args):  # type: ignore[no-untyped-def]
@@ -162,25 +227,20 @@ def by_address(context, builder, signature, args):  # type: ignore[no-untyped-de
     return context.get_dummy_value() if returned == types.void else found
 
 
-@intrinsic
-def call_begin(typing, where, row, s):  # type: ignore[no-untyped-def]
-    """Call `begin` of a law."""
-    return REAL(WHOLE, REALS_AT, REALS_AT), by_address
+def calling(returns: Any, *takes: Any) -> Any:
+    """Return a function that calls one of this signature by its address, the first argument."""
+
+    def call(typing, where, *given):  # type: ignore[no-untyped-def]
+        return returns(WHOLE, *takes), by_address
+
+    names = ("typing", "where", *(f"given_{k}" for k in range(len(takes))))
+    call.__signature__ = Signature(  # type: ignore[attr-defined]
+        [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in names]
+    )
+    return intrinsic(call)
 
 
-@intrinsic
-def call_evaluate(typing, where, row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
-    """Call `evaluate` of a law."""
-    return REAL(WHOLE, REALS_AT, REALS_AT, REALS_AT, REALS_AT, WHOLE, WHOLE, REALS_AT), by_address
-
-
-@intrinsic
-def call_switch(typing, where, row, s, up, out):  # type: ignore[no-untyped-def]
-    """Call `switch` of a law."""
-    return REAL(WHOLE, REALS_AT, REALS_AT, WHOLE, REALS_AT), by_address
-
-
-@intrinsic
-def call_number(typing, where, row, s, number):  # type: ignore[no-untyped-def]
-    """Call `settle` or `strain` of a law."""
-    return REAL(WHOLE, REALS_AT, REALS_AT, REAL), by_address
+call_begin = calling(REAL, REALS_AT, SPRING)
+call_evaluate = calling(REAL, REALS_AT, SPRING, REALS_AT, REALS_AT, WHOLE, WHOLE, REALS_AT)
+call_switch = calling(REAL, REALS_AT, SPRING, WHOLE, REALS_AT)
+call_number = calling(REAL, REALS_AT, SPRING, REAL)  #: `settle` or `strain`

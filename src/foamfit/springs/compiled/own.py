@@ -21,33 +21,26 @@ from numba.extending import intrinsic
 
 from foamfit.arrays import Array
 from foamfit.springs.compiled.contract import (
-    BRANCH,
     BY,
     BY_HELD,
     EPS,
     EVALUATE,
     EXPLICIT,
-    HIGH,
     INTERNAL,
-    LOSSY,
-    LOW,
     MISS,
     OF_LAW,
     OPTIONS,
     OWN,
-    RATE,
     REAL,
     REALS_AT,
     RESULTS,
-    SIGMA_HIGH,
-    SIGMA_LOW,
     SLOPE,
-    SOFT,
-    TURNS,
+    SPRING,
     WHOLE,
     Compiled,
     X,
     address,
+    as_spring,
     beginning,
     call_begin,
     call_evaluate,
@@ -112,7 +105,7 @@ def room_of(row, s):  # type: ignore[no-untyped-def]
 def gather(row, s, eps, x, n, j):  # type: ignore[no-untyped-def]
     """Gather the arguments of the formulas at a point; return them, and room for results."""
     point, inside, count = room_of(row, s), int(s[INSIDE]), int(s[COUNT])
-    point[0], point[1] = complex(eps, 0.0), complex(s[RATE], 0.0)
+    point[0], point[1] = complex(eps, 0.0), complex(s.rate, 0.0)
     for k in range(inside):
         point[2 + k] = complex(x[k * n + j], 0.0)
     for k in range(count):
@@ -123,7 +116,7 @@ def gather(row, s, eps, x, n, j):  # type: ignore[no-untyped-def]
 @inner
 def stress_of(row, s, point, found):  # type: ignore[no-untyped-def]
     """Return stress and slope at the arguments `point`, whose strain has the imaginary step."""
-    call_formulas(int(s[FORMULAS]), point, int(s[BRANCH]), VALUES, found)
+    call_formulas(int(s[FORMULAS]), point, int(s.branch), VALUES, found)
     return found[0].real, found[0].imag / STEP
 
 
@@ -131,41 +124,41 @@ def stress_of(row, s, point, found):  # type: ignore[no-untyped-def]
 def bound(row, s, point, found):  # type: ignore[no-untyped-def]
     """Set the ends of the branch."""
     found[0], found[1], found[2] = complex(-math.inf, 0.0), complex(math.inf, 0.0), 0j
-    call_formulas(int(s[FORMULAS]), point, int(s[BRANCH]), ENDS, found)
-    s[LOW], s[HIGH], s[TURNS] = found[0].real, found[1].real, found[2].real
+    call_formulas(int(s[FORMULAS]), point, int(s.branch), ENDS, found)
+    s.low, s.high, s.turns = found[0].real, found[1].real, found[2].real
 
 
 @inner
 def bound_stress(row, s, point, found):  # type: ignore[no-untyped-def]
     """Set the stresses at the ends of the branch of an EXPLICIT law."""
     low, high, flat, size = -math.inf, math.inf, True, 0.0
-    if s[LOW] > -math.inf:
-        point[0] = complex(s[LOW], STEP)
+    if s.low > -math.inf:
+        point[0] = complex(s.low, STEP)
         low, slope = stress_of(row, s, point, found)
         flat, size = flat and slope == 0.0, abs(low)
-    if s[HIGH] < math.inf:
-        point[0] = complex(s[HIGH], STEP)
+    if s.high < math.inf:
+        point[0] = complex(s.high, STEP)
         high, slope = stress_of(row, s, point, found)
         flat, size = flat and slope == 0.0, max(size, abs(high))
     if flat and abs(high - low) <= 1e-14 * size:  # without rounding
         high = low
-    s[SIGMA_LOW], s[SIGMA_HIGH] = low, high
+    s.sigma_low, s.sigma_high = low, high
 
 
 @inner
 def enter(row, s):  # type: ignore[no-untyped-def]
     """Set the ends of a branch at its beginning."""
-    point, found = gather(row, s, s[EPS], past(s, X), 1, 0)
+    point, found = gather(row, s, s.eps, past(s, X), 1, 0)
     bound(row, s, point, found)
-    s[SIGMA_LOW], s[SIGMA_HIGH] = -math.inf, math.inf
+    s.sigma_low, s.sigma_high = -math.inf, math.inf
     if s[KIND] == EXPLICIT:
         bound_stress(row, s, point, found)
 
 
 @beginning
 def _begin(row, s):  # type: ignore[no-untyped-def]
-    s[EPS] = s[BRANCH] = s[RATE] = 0.0
-    s[LOSSY] = s[DAMPS]
+    s.eps = s.branch = s.rate = 0.0
+    s.lossy = s[DAMPS]
     for k in range(int(s[INSIDE])):
         s[X + k] = 0.0
     enter(row, s)
@@ -175,7 +168,7 @@ def _begin(row, s):  # type: ignore[no-untyped-def]
 @inner
 def evaluate_explicit(row, s, eps, n, want, out):  # type: ignore[no-untyped-def]
     """Fill the results of an EXPLICIT law."""
-    where, count, branch = int(s[FORMULAS]), int(s[COUNT]), int(s[BRANCH])
+    where, count, branch = int(s[FORMULAS]), int(s[COUNT]), int(s.branch)
     point, found = gather(row, s, 0.0, s, 1, 0)
     for j in range(n):
         point[0] = complex(eps[j], STEP)
@@ -195,7 +188,7 @@ def evaluate_explicit(row, s, eps, n, want, out):  # type: ignore[no-untyped-def
 @inner
 def evaluate_internal(row, s, eps, x, n, want, out):  # type: ignore[no-untyped-def]
     """Fill the results of an INTERNAL law."""
-    where, count, branch = int(s[FORMULAS]), int(s[COUNT]), int(s[BRANCH])
+    where, count, branch = int(s[FORMULAS]), int(s[COUNT]), int(s.branch)
     inside = int(s[INSIDE])
     size, at = 2 + 2 * inside, BY + count
     for j in range(n):
@@ -237,11 +230,11 @@ def _evaluate(row, s, eps, x, n, want, out):  # type: ignore[no-untyped-def]
 @inner
 def derive_switch(row, s, turns, up, out):  # type: ignore[no-untyped-def]
     """Fill the derivatives of internal variables on the next branch, and of the end, by ε, x, p."""
-    where, count, branch = int(s[FORMULAS]), int(s[COUNT]), int(s[BRANCH])
+    where, count, branch = int(s[FORMULAS]), int(s[COUNT]), int(s.branch)
     inside = int(s[INSIDE])
     wide = 1 + inside + count
     for q in range(wide):
-        point, found = gather(row, s, s[EPS], past(s, X), 1, 0)
+        point, found = gather(row, s, s.eps, past(s, X), 1, 0)
         at = q if q == 0 else q + 1
         kept = point[at].real
         point[at] = complex(kept, STEP)
@@ -256,14 +249,14 @@ def derive_switch(row, s, turns, up, out):  # type: ignore[no-untyped-def]
 
 @switching
 def _switch(row, s, up, out):  # type: ignore[no-untyped-def]
-    turns = s[TURNS] * (1.0 if up else -1.0) < 0.0
+    turns = s.turns * (1.0 if up else -1.0) < 0.0
     if not turns:
-        s[EPS] = s[HIGH] if up else s[LOW]
+        s.eps = s.high if up else s.low
     if s[KIND] == INTERNAL:
         derive_switch(row, s, turns, up, out)
-    point, found = gather(row, s, s[EPS], past(s, X), 1, 0)
+    point, found = gather(row, s, s.eps, past(s, X), 1, 0)
     what = UP if up else DOWN
-    s[BRANCH] = call_formulas(int(s[FORMULAS]), point, int(s[BRANCH]), what, found)
+    s.branch = call_formulas(int(s[FORMULAS]), point, int(s.branch), what, found)
     for k in range(int(s[INSIDE])):
         s[X + k] = point[2 + k].real
     enter(row, s)
@@ -272,7 +265,7 @@ def _switch(row, s, up, out):  # type: ignore[no-untyped-def]
 
 @settling
 def _settle(row, s, eps):  # type: ignore[no-untyped-def]
-    s[EPS] = eps
+    s.eps = eps
     return 0.0
 
 
@@ -280,27 +273,27 @@ def _settle(row, s, eps):  # type: ignore[no-untyped-def]
 def _strain(row, s, sigma):  # type: ignore[no-untyped-def]
     """Search by Newton's method inside a bracket."""
     point, found = gather(row, s, 0.0, past(s, X), 1, 0)
-    if s[SIGMA_LOW] == s[SIGMA_HIGH]:
-        s[SOFT] = math.inf
-        return s[LOW]
-    eps, low, high = min(max(s[EPS], s[LOW]), s[HIGH]), -math.inf, math.inf
+    if s.sigma_low == s.sigma_high:
+        s.soft = math.inf
+        return s.low
+    eps, low, high = min(max(s.eps, s.low), s.high), -math.inf, math.inf
     for trial in range(TRIALS):
         point[0] = complex(eps, STEP)
         value, slope = stress_of(row, s, point, found)
         miss = value - sigma
         if abs(eps) > FURTHEST:
-            s[SOFT] = 0.0
+            s.soft = 0.0
             return math.inf if eps > 0.0 else -math.inf
         if not abs(miss) < math.inf:  # beyond the strains that the law admits
             miss = math.inf if eps > 0.0 else -math.inf
-        s[SOFT] = 1.0 / slope if slope > 0.0 else math.inf
+        s.soft = 1.0 / slope if slope > 0.0 else math.inf
         if miss > 0.0:
             high = eps
         elif miss < 0.0:
             low = eps
         else:
             break
-        new = eps - miss * s[SOFT]
+        new = eps - miss * s.soft
         if abs(new - eps) <= 2e-16 * abs(eps):
             break
         if not low < new < high or trial % 8 == 7:
@@ -317,7 +310,7 @@ def _strain(row, s, sigma):  # type: ignore[no-untyped-def]
 @outer
 def _slope_at_rest(where, row, s):  # type: ignore[no-untyped-def]
     """Return dσ/dε at rest along the path of the internal variables."""
-    block, own = start(s), start(row)
+    block, own = as_spring(start(s)), start(row)
     call_begin(where[0], own, block)
     inside, count, out = int(block[INSIDE]), int(block[COUNT]), past(block, RESULTS)
     call_evaluate(where[EVALUATE], own, block, past(block, EPS), past(block, X), 1, 2, out)
@@ -411,7 +404,7 @@ def compile_law(law: Law) -> Compiled:
     where = float(made.library.get_pointer_to_function(made.fndesc.llvm_func_name))  # below 2^53
     begin_any = _begin.address
 
-    @cfunc(REAL(REALS_AT, REALS_AT), **OPTIONS)
+    @cfunc(REAL(REALS_AT, SPRING), **OPTIONS)
     def begin(row, s):  # type: ignore[no-untyped-def]
         s[FORMULAS], s[KIND], s[COUNT], s[INSIDE] = where, kind, count, inside
         s[BOUNDED], s[DAMPS] = bounded, damps

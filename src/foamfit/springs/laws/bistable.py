@@ -12,14 +12,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.springs.law import BRANCH_NAMES, derived_points
 from foamfit.springs.laws.record import LAST_STRAIN, Between, Compared, Law, Param, PointOf
-from foamfit.springs.laws.shared import (
-    COMPARED_ETA,
-    COMPARED_HEIGHT,
-    COMPARED_K0,
-    K0,
-    KC,
-    steeper,
-)
+from foamfit.springs.laws.shared import COMPARED_ETA, COMPARED_HEIGHT, COMPARED_K0, K0, KC, steeper
 from foamfit.springs.loop import Loop
 from foamfit.springs.spring import Relaxation, Spring, freeze_numbers, freeze_terms, require
 

@@ -125,7 +125,7 @@ def _trial(law: Law) -> str | None:
     try:
         if row_of(law, values) is None:
             return f"admissible refuses its own start values ({shown}); give others"
-        stress, branches = stress_along(LawSpring(law, [*values, 0.0]), TRIED)
+        stress, branches = stress_along(law, LawSpring(law, [*values, 0.0]).row, TRIED)
     except Exception as error:  # any error of the compiler in a user's function
         return f"its functions cannot be compiled or run ({type(error).__name__}: {_told(error)})"
     if not np.all(np.isfinite(stress)):

@@ -14,14 +14,7 @@ from numpy.typing import ArrayLike
 from foamfit.arrays import Array
 from foamfit.springs.law import BRANCH_NAMES, most_beyond
 from foamfit.springs.laws.record import LAST_STRAIN, Between, Compared, Law, Param
-from foamfit.springs.laws.shared import (
-    COMPARED_ETA,
-    COMPARED_HEIGHT,
-    COMPARED_K0,
-    K0,
-    KC,
-    steeper,
-)
+from foamfit.springs.laws.shared import COMPARED_ETA, COMPARED_HEIGHT, COMPARED_K0, K0, KC, steeper
 from foamfit.springs.loop import Loop
 from foamfit.springs.spring import (
     Relaxation,

@@ -20,6 +20,11 @@ from foamfit.errors import InputError
 from foamfit.springs.loop import Loop
 
 LAST_STRAIN = 0.999
+# Directions of derivatives, beside the places of parameters in their law: dashpot, height, onsite
+# damper, and from OWN_RELAXATION on g and τ of each relaxation term; MOVED is the derivative of a
+# single spring by a shift of the prescribed motion of all samples in contact.
+OWN_ETA, OWN_HEIGHT, DRAG, OWN_RELAXATION = range(1_000_000, 1_000_004)
+MOVED = -1
 
 # Conditions on the value of a parameter, by their wording in messages.
 ADMISSIBLE: dict[str, Callable[[float], bool]] = {
@@ -146,7 +151,7 @@ class Law:
     kind: str  #: name in models: "bistable", "linear+bistable"
     #: parameters, without dashpot, relaxation terms and height
     params: tuple[Param, ...]
-    functions: Functions | str  #: or the name of a built-in law
+    functions: Functions | Any  #: or the name of a built-in law, or compiled functions
     internal: int = 0  #: number of internal variables
     #: branches in the order of their numbers, the first at rest: name and description
     branches: Mapping[str, str] = field(default_factory=lambda: {"line": "the law"})

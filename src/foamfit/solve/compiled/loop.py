@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 from numba import njit
-from numba.extending import intrinsic
 
-from foamfit.solve.events import (
+from foamfit.solve.compiled.events import (
     DOUBTFUL,
     FAILED,
     PLAIN,
@@ -22,70 +21,33 @@ from foamfit.solve.events import (
     look,
     take_step,
 )
-from foamfit.solve.motion import rates
-from foamfit.solve.run import (
-    BEGUN,
-    BRIEF,
-    DAMPED,
-    EPS_AT,
-    FLAT,
-    GRAVITY,
-    GROW,
-    HORIZON,
-    INTERNALS,
-    KIND,
-    LARGEST,
-    LAST,
-    LOGGED,
-    NOW,
-    NUMBERS,
+from foamfit.solve.compiled.motion import rates
+from foamfit.solve.compiled.run import (
     OF_EPS,
     OF_V,
     OF_W,
-    OVERDAMPED,
-    PARAMETERS,
-    PRESSED,
     RECORD,
-    SAMPLE,
     SCALES,
-    STEP,
     STEPPED,
-    TAKEN,
-    VALUE,
-    X_AT,
     begin_run,
+    numbers,
+    spring,
 )
-from foamfit.solve.samples import approach, fly, write_inside
-from foamfit.solve.scene import (
-    DONE,
-    FLAT_UNDER_STRESS,
-    NOT_FINITE,
-    STEP_UNDERFLOW,
-    TOO_MANY_STEPS,
-)
+from foamfit.solve.compiled.samples import approach, fly, write_inside
+from foamfit.solve.scene import DONE, FLAT_UNDER_STRESS, NOT_FINITE, STEP_UNDERFLOW, TOO_MANY_STEPS
 from foamfit.springs.compiled.contract import (
-    BRANCH,
     BY,
     BY_STRESS,
-    EPS,
-    ETA,
-    GAIN,
-    HEIGHT,
     INTERNAL,
-    MISS,
     OPTIONS,
-    RATE,
     RELAX,
-    SLOPE,
-    TANGENT,
-    TOTAL,
-    TURNS,
+    RESULTS,
     WHOLE,
-    by_address,
+    calling,
     inlined,
     inner,
     past,
-)  # fmt: skip
+)
 
 # Numbers that a run is given, after onsite damping and pace: velocity of a striker, tolerance,
 # bound on steps, length of a short implicit step, whether the contact is overdamped, least scales
@@ -103,9 +65,7 @@ LEAST_SHARE = 1e-6  # of the largest scale of nodes, see `_fresh_scales`
 SWITCHED, RELEASED, STALLED = 1, 2, 3  # what happened in a step
 
 
-@intrinsic
-def _call_drive(typing, where, c, starts, want):  # type: ignore[no-untyped-def]
-    return WHOLE(WHOLE, RECORD, WHOLE, WHOLE), by_address
+_call_drive = calling(WHOLE, RECORD, WHOLE, WHOLE)
 
 
 @inlined
@@ -121,9 +81,9 @@ def _first_step(c, tol):  # type: ignore[no-untyped-def]
     for g in range(c.nodes - 1, -1, -1):
         soft = 0.0
         for i in range(c.ends[g - 1] if g > 0 else 0, c.ends[g]):
-            s = past(c.springs, i * c.width)
-            stiff = s[GAIN] * s[c.results + SLOPE]
-            soft += s[HEIGHT] / stiff if stiff > 0.0 else 0.0
+            s = spring(c, i)
+            stiff = s.gain * s.slope
+            soft += s.height / stiff if stiff > 0.0 else 0.0
         soft = soft if soft > 0.0 else math.inf
         fastest = max(fastest, (1.0 / soft + before) * c.per_mass[g])
         before = 1.0 / soft
@@ -140,50 +100,50 @@ def _mend(c, y):  # type: ignore[no-untyped-def]
     for g in range(c.none if not c.solved else c.groups, c.groups):
         i0, soft, mean, count = c.ends[g - 1] if g > 0 else c.none, 0.0, 0.0, 0
         for i in range(i0, c.ends[g]):
-            s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-            if n[KIND] == BY_STRESS:
-                change = s[c.results + MISS] * s[c.results + SLOPE]
-                y[n[X_AT]] -= change
-                s[TOTAL] -= s[GAIN] * change
-            if s[ETA] == 0.0 and n[EPS_AT] >= 0 and s[TANGENT] > 0.0:
-                compliance = s[HEIGHT] / (s[GAIN] * s[TANGENT])
-                soft, mean, count = soft + compliance, mean + compliance * s[TOTAL], count + 1
-            elif s[ETA] == 0.0:
+            s, n = spring(c, i), numbers(c, i)
+            if n.kind == BY_STRESS:
+                change = s.miss * s.slope
+                y[n.x_at] -= change
+                s.total -= s.gain * change
+            if s.eta == 0.0 and n.eps_at >= 0 and s.tangent > 0.0:
+                compliance = s.height / (s.gain * s.tangent)
+                soft, mean, count = soft + compliance, mean + compliance * s.total, count + 1
+            elif s.eta == 0.0:
                 count -= c.count  # a flat branch takes the rest
         if count < 2:
             continue
         for i in range(i0, c.ends[g]):
-            s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-            if s[ETA] == 0.0:
-                longer = (mean / soft - s[TOTAL]) / (s[GAIN] * s[TANGENT])
-                y[n[EPS_AT]] += longer
-                if n[KIND] == BY_STRESS:
-                    y[n[X_AT]] += longer * s[TANGENT]
-                elif n[KIND] == INTERNAL:
-                    for k in range(n[INTERNALS]):
-                        y[n[X_AT] + k] += longer * s[c.results + BY + n[PARAMETERS] + 2 + k]
+            s, n = spring(c, i), numbers(c, i)
+            if s.eta == 0.0:
+                longer = (mean / soft - s.total) / (s.gain * s.tangent)
+                y[n.eps_at] += longer
+                if n.kind == BY_STRESS:
+                    y[n.x_at] += longer * s.tangent
+                elif n.kind == INTERNAL:
+                    for k in range(n.internals):
+                        y[n.x_at + k] += longer * s[RESULTS + BY + n.parameters + 2 + k]
 
 
 @inner
 def _log(c, i, left):  # type: ignore[no-untyped-def]
     """Log a change of branch, if there is room."""
-    s, r, at = past(c.springs, i * c.width), c.now, int(c.now[LOGGED])
+    s, r, at = spring(c, i), c.now, int(c.now.logged)
     if at < c.room:
         log = past(c.log, 5 * at)
-        log[0], log[1], log[2], log[3], log[4] = r[BEGUN] + r[NOW], i, left, s[BRANCH], s[EPS]
-    r[LOGGED] += 1.0
+        log[0], log[1], log[2], log[3], log[4] = r.begun + r.now, i, left, s.branch, s.eps
+    r.logged += 1.0
 
 
 @inner
 def _switch(c, i, up, want):  # type: ignore[no-untyped-def]
     """Change the branch of a spring now."""
-    s, r = past(c.springs, i * c.width), c.now
-    left, steep = s[BRANCH], s[TANGENT]
+    s, r = spring(c, i), c.now
+    left, steep = s.branch, s.tangent
     change_branch(c, i, up, c.y)
     _log(c, i, left)
-    rates(c, c.y, c.stage, want, r[NOW])
-    if steep > 0.0 and s[TANGENT] > 0.0:
-        r[GROW] *= min(max(math.sqrt(steep / s[TANGENT]), 0.2), 2.0)
+    rates(c, c.y, c.stage, want, r.now)
+    if steep > 0.0 and s.tangent > 0.0:
+        r.grow *= min(max(math.sqrt(steep / s.tangent), 0.2), 2.0)
 
 
 @inner
@@ -196,10 +156,10 @@ def _turn(c, want, changed):  # type: ignore[no-untyped-def]
     for _ in range(4 * c.count):
         turned = False
         for i in range(c.count):
-            s = past(c.springs, i * c.width)
-            jumps = changed < 0 or (i != changed and s[ETA] == 0.0)
-            if jumps and s[TURNS] * s[RATE] < 0.0:
-                _switch(c, i, int(s[TURNS] < 0.0), want)
+            s = spring(c, i)
+            jumps = changed < 0 or (i != changed and s.eta == 0.0)
+            if jumps and s.turns * s.rate < 0.0:
+                _switch(c, i, int(s.turns < 0.0), want)
                 turned = True
         if not turned:
             return
@@ -213,18 +173,18 @@ def _pass_event(c, want, share, who, kind):  # type: ignore[no-untyped-def]
         look(c, share - 1e-3)
         before = c.carried[0]
         look(c, share + 1e-3)
-        slope = (c.carried[0] - before) / (2e-3 * r[STEP])
+        slope = (c.carried[0] - before) / (2e-3 * r.step)
     dense(c, n, share, c.state)
     for k in range(n):
         y[k] = c.state[k]
-    r[NOW] += share * r[STEP]
-    r[GROW] = min(r[GROW], 1.0)
-    rates(c, y, c.stage, want, r[NOW])
+    r.now += share * r.step
+    r.grow = min(r.grow, 1.0)
+    rates(c, y, c.stage, want, r.now)
     _mend(c, y)
-    rates(c, y, c.stage, want, r[NOW])
+    rates(c, y, c.stage, want, r.now)
     if kind == RELEASE:
         return slope
-    turns = c.springs[who * c.width + TURNS]
+    turns = spring(c, who).turns
     _switch(c, who, int(turns < 0.0) if kind == TURN else int(kind == TOP_END), want)
     _turn(c, want, who)
     return slope
@@ -235,12 +195,12 @@ def _finish_step(c, struck):  # type: ignore[no-untyped-def]
     """Advance to the end of a step."""
     r, y, stage, new, wide = c.now, c.y, c.stage, c.new, c.wide
     keep_values(c)
-    if struck and c.carried[0] > RISEN * r[LARGEST]:
-        r[PRESSED] = 1.0
+    if struck and c.carried[0] > RISEN * r.largest:
+        r.pressed = 1.0
     for k in range(wide):
         y[k], stage[k] = new[k], stage[STEPPED * wide + k]
     _mend(c, y)
-    r[NOW] = r[HORIZON] if r[NOW] + r[STEP] >= r[HORIZON] else r[NOW] + r[STEP]
+    r.now = r.horizon if r.now + r.step >= r.horizon else r.now + r.step
 
 
 @inner
@@ -250,7 +210,7 @@ def _fresh_scales(c):  # type: ignore[no-untyped-def]
     A dashpot under a mass that hardly moves makes the base stress of its velocity, so each node has
     a scale of its own, down to LEAST_SHARE of the largest.
     """
-    y, rate, scales, kinds, part = c.y, c.stage, c.scales, c.kinds, 0.1 * c.now[STEP]
+    y, rate, scales, kinds, part = c.y, c.stage, c.scales, c.kinds, 0.1 * c.now.step
     for k in range(c.base):
         kind = kinds[k]
         scales[kind] = max(scales[kind], max(abs(y[k]), part * abs(rate[k])))
@@ -272,7 +232,7 @@ def _longest(c, want):  # type: ignore[no-untyped-def]
     longest = math.inf
     if want and c.degree == 0:
         for i in range(c.count):
-            s = past(c.springs, i * c.width)
+            s = spring(c, i)
             for k in range(c.terms):
                 if s[RELAX + 2 * k] > 0.0:
                     longest = min(longest, FADES * s[RELAX + 2 * k + 1])
@@ -287,11 +247,11 @@ def _begin(c, reals, mass):  # type: ignore[no-untyped-def]
         c.scales[k] = reals[LEAST + k]
     for i in range(c.count):  # of the strain of each spring
         c.scales[SCALES + i] = reals[LEAST + OF_EPS]
-    r[BRIEF], r[LAST], r[GROW], c.drive[OVERDAMPED] = reals[BRIEFLY], 1e-4, 1.0, reals[OVER]
+    r.brief, r.last, r.grow, c.drive.overdamped = reals[BRIEFLY], 1e-4, 1.0, reals[OVER]
     if reals[SPEED] > 0.0:
         c.y[2 * top + 1] = reals[SPEED]
-        c.drive[VALUE], c.drive[GRAVITY] = c.values[0], c.values[0] / mass[top]
-        r[HORIZON] = max(c.time[c.samples - 1], 1e-30)  # a sample at contact needs a step
+        c.drive.value, c.drive.gravity = c.values[0], c.values[0] / mass[top]
+        r.horizon = max(c.time[c.samples - 1], 1e-30)  # a sample at contact needs a step
         approach(c, reals[SPEED])
 
 
@@ -305,14 +265,14 @@ def _advance(c, how, struck, want):  # type: ignore[no-untyped-def]
     if how == DOUBTFUL:
         share, who, kind = first_event(c)
     if struck and how != PLAIN:
-        whole = who < 0 and r[NOW] + r[STEP] >= r[HORIZON]
-        write_inside(c, r[HORIZON] if whole else r[NOW] + share * r[STEP], want)
+        whole = who < 0 and r.now + r.step >= r.horizon
+        write_inside(c, r.horizon if whole else r.now + share * r.step, want)
     if who < 0:
         if how != PLAIN:
-            rates(c, c.new, c.f, c.none, r[NOW] + r[STEP])
+            rates(c, c.new, c.f, c.none, r.now + r.step)
         _finish_step(c, struck)
         return c.none
-    moved = share * r[STEP] > 1e-15 * abs(r[NOW])
+    moved = share * r.step > 1e-15 * abs(r.now)
     slope = _pass_event(c, want, share, who, kind)
     if kind == RELEASE:
         fly(c, slope)
@@ -323,11 +283,11 @@ def _advance(c, how, struck, want):  # type: ignore[no-untyped-def]
 @inner
 def _failure(c, how, most):  # type: ignore[no-untyped-def]
     """Return how a run ends after a step: DONE if it goes on."""
-    if c.drive[FLAT] > 0.0:
+    if c.drive.flat > 0.0:
         return c.none + FLAT_UNDER_STRESS
     if how == FAILED and not abs(c.new[0]) < math.inf:
         return c.none + NOT_FINITE
-    if c.now[TAKEN] >= most:
+    if c.now.taken >= most:
         return c.none + TOO_MANY_STEPS
     return c.none + (STEP_UNDERFLOW if how == FAILED else DONE)
 
@@ -347,20 +307,20 @@ def integrate(  # type: ignore[no-untyped-def]
     _begin(c, reals, mass)
     if struck:
         rates(c, c.y, c.stage, want, 0.0)
-        short = FIRST * r[BRIEF]
-        r[STEP] = min(r[HORIZON], short if c.degree and short > 0.0 else _first_step(c, tol))
+        short = FIRST * r.brief
+        r.step = min(r.horizon, short if c.degree and short > 0.0 else _first_step(c, tol))
         if c.inside_at:  # a stress that depends on the rate may stop the striker at once
             top = 2 * c.groups - 1
-            r[STEP] = min(r[STEP], STOPPED * abs(c.y[top] / c.stage[top]))
+            r.step = min(r.step, STOPPED * abs(c.y[top] / c.stage[top]))
     else:
         done = drive(c, 1, want)
-        r[STEP] = r[HORIZON]
+        r.step = r.horizon
     outcome, ended, longest = DONE, math.nan, _longest(c, want)
-    while not (done or (struck and int(r[SAMPLE]) == c.samples)):
+    while not (done or (struck and int(r.sample) == c.samples)):
         _fresh_scales(c)
         keep_values(c)
-        r[STEP] = min(r[STEP], r[HORIZON] - r[NOW], longest)
-        upto = c.time[int(r[SAMPLE])] if struck else math.inf
+        r.step = min(r.step, r.horizon - r.now, longest)
+        upto = c.time[int(r.sample)] if struck else math.inf
         how = take_step(c, want, tol, upto, most)
         outcome = _failure(c, how, most)
         event = _advance(c, how, struck, want) if outcome == DONE else c.none
@@ -368,21 +328,21 @@ def integrate(  # type: ignore[no-untyped-def]
         if stalled > 4 * c.count + 8:
             outcome = STEP_UNDERFLOW
         if outcome != DONE or event == RELEASED:
-            ended = r[BEGUN] + r[NOW]
+            ended = r.begun + r.now
             break
-        dt = r[STEP] * r[GROW]
-        if r[NOW] >= r[HORIZON] and struck:
-            r[HORIZON] = math.nextafter(r[NOW], math.inf)
-        elif r[NOW] >= r[HORIZON]:
+        dt = r.step * r.grow
+        if r.now >= r.horizon and struck:
+            r.horizon = math.nextafter(r.now, math.inf)
+        elif r.now >= r.horizon:
             done = drive(c, c.none, want)
             _turn(c, want, -1 + c.none)
-        r[STEP] = dt
+        r.step = dt
     endings[OUTCOME], endings[ENDED] = outcome, ended
-    endings[STEPS], endings[SWITCHES] = r[TAKEN], r[LOGGED]
+    endings[STEPS], endings[SWITCHES] = r.taken, r.logged
     endings[STRONGEST], endings[FARTHEST], endings[DAMPED_OUT] = (
-        r[LARGEST],
+        r.largest,
         c.scales[OF_W],
-        r[DAMPED],
+        r.damped,
     )
     endings[MOTION_LOST], endings[STRESS_LOST] = c.worst[0], c.worst[1]
     for j in range(c.p):

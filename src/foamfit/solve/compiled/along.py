@@ -12,32 +12,23 @@ import math
 
 from numba import njit
 
-from foamfit.solve.events import change_branch
-from foamfit.solve.motion import evaluate
-from foamfit.solve.run import KIND, begin_run
-from foamfit.solve.samples import row_of
+from foamfit.solve.compiled.events import change_branch
+from foamfit.solve.compiled.motion import evaluate
+from foamfit.solve.compiled.run import begin_run
+from foamfit.solve.compiled.samples import row_of
 from foamfit.springs.compiled.contract import (
-    BRANCH,
     BY,
     BY_HELD,
     BY_STRESS,
-    EPS,
-    HIGH,
-    LOW,
-    OF_LAW,
     OPTIONS,
-    PER_HEIGHT,
     RELAX,
-    SETTLE,
-    SLOPE,
-    TURNS,
-    X,
+    RESULTS,
     call_number,
     inner,
     past,
     start,
 )
-from foamfit.springs.parameters import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
+from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
 OF_STEP, TABLE = 6, 8  # columns of the table of a relaxation term, which begins with moments
 LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the middle adds
@@ -47,25 +38,25 @@ LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the mi
 def bring_to(c, eps):  # type: ignore[no-untyped-def]
     """Bring the spring to a strain on its branch; return the stress."""
     s, n = c.springs, c.numbers
-    call_number(n[SETTLE], past(s, c.row), s, eps)
+    call_number(n.settle, past(s, c.row), s, eps)
     evaluate(c, c.none, int(c.p > 0))
-    return s[c.results + OF_LAW]
+    return s.sigma
 
 
 @inner
 def derive(c, seed, y):  # type: ignore[no-untyped-def]
     """Fill the derivatives of the stress now in `part`, and those of the strain."""
     s, n, p = c.springs, c.numbers, c.p
-    out, held, part, strain = past(s, c.results), c.held, c.part, c.strain
+    out, held, part, strain = past(s, RESULTS), c.held, c.part, c.strain
     for j in range(p):
         own = c.directions[2 * j + 1]
-        strain[j] = s[PER_HEIGHT] * (seed[0] + seed[1] * s[EPS]) if own == MOVED else 0.0
+        strain[j] = s.per_height * (seed[0] + seed[1] * s.eps) if own == MOVED else 0.0
         if own == OWN_HEIGHT:
-            strain[j] = -s[EPS] * s[PER_HEIGHT]
+            strain[j] = -s.eps * s.per_height
         part[j] = out[BY + own] if 0 <= own < OWN_ETA else 0.0
-        if n[KIND] == BY_STRESS:
+        if n.kind == BY_STRESS:
             part[j] += out[BY_HELD] * held[j] + out[BY_HELD + 1] * held[p + j]
-        c.common[j] = part[j] + out[SLOPE] * strain[j]
+        c.common[j] = part[j] + s.slope * strain[j]
 
 
 @inner
@@ -120,7 +111,7 @@ def relax(c, h, tables, y, first, low, high, last, bump, d_first, d_middle):  # 
 def sum_up(c, y, j):  # type: ignore[no-untyped-def]
     """Write stress and derivatives of a sample, with all terms."""
     s, p = c.springs, c.p
-    sigma = s[c.results + OF_LAW]
+    sigma = s.sigma
     total = sigma
     for q in range(p):
         slope = c.common[q]
@@ -146,8 +137,7 @@ def step_to(c, part, h, m, seed, y, tol, weight):  # type: ignore[no-untyped-def
         past(m, 2 + c.terms * TABLE),
         past(m, 2 + c.terms * TABLE + p),
     )
-    out = past(s, c.results)
-    origin, first, slope, x = s[EPS], out[OF_LAW], out[SLOPE], s[X]
+    origin, first, slope, x = s.eps, s.sigma, s.slope, s.x
     step = part - origin
     for j in range(p):
         d_first[j] = c.common[j]
@@ -160,11 +150,11 @@ def step_to(c, part, h, m, seed, y, tol, weight):  # type: ignore[no-untyped-def
     for j in range(p):
         d_middle[j] = c.common[j]
     last = bring_to(c, part)
-    low, high = slope * step, out[SLOPE] * step
+    low, high = slope * step, s.slope * step
     bump = half - (0.5 * (first + last) + 0.125 * (low - high))
     size = max(m[0], abs(last))
     if FOLLOWED * weight * abs(bump) > tol * size and m[1] > LEAST_STEP:
-        s[EPS], s[X] = origin, x
+        s.eps, s.x = origin, x
         bring_to(c, origin)
         for j in range(p):
             c.common[j] = d_first[j]
@@ -181,23 +171,23 @@ def step_to(c, part, h, m, seed, y, tol, weight):  # type: ignore[no-untyped-def
 @inner
 def go_to(c, eps, between, m, seed, y, tol, weight):  # type: ignore[no-untyped-def]
     """Go to the strain of the next sample, `between` later, from branch to branch."""
-    s, begun, left, pace = c.springs, c.springs[EPS], 1.0, 1.0
-    while left > 0.0 or s[EPS] != eps:
-        up = eps > s[EPS]
-        if s[EPS] != eps and s[TURNS] * (1.0 if up else -1.0) < 0.0:
+    s, begun, left, pace = c.springs, c.springs.eps, 1.0, 1.0
+    while left > 0.0 or s.eps != eps:
+        up = eps > s.eps
+        if s.eps != eps and s.turns * (1.0 if up else -1.0) < 0.0:
             change_branch(c, c.none, int(up), y)
-            bring_to(c, s[EPS])
+            bring_to(c, s.eps)
             derive(c, seed, y)
         goal, until, leaving = eps, 0.0, False
-        if up and eps > s[HIGH]:
-            goal, leaving = s[HIGH], True
-        elif not up and eps < s[LOW]:
-            goal, leaving = s[LOW], True
+        if up and eps > s.high:
+            goal, leaving = s.high, True
+        elif not up and eps < s.low:
+            goal, leaving = s.low, True
         if leaving:
             until = min(max((eps - goal) / (eps - begun), 0.0), left)
         share, part, whole = left - until, goal, True
         if pace < share:
-            part, whole = s[EPS] + pace / share * (goal - s[EPS]), False
+            part, whole = s.eps + pace / share * (goal - s.eps), False
             share = pace
         m[1] = share
         if not step_to(c, part, share * between, m, seed, y, tol, weight):
@@ -209,9 +199,9 @@ def go_to(c, eps, between, m, seed, y, tol, weight):  # type: ignore[no-untyped-
         pace = 1.0 if whole else 2.0 * share
         if leaving and whole:
             change_branch(c, c.none, int(up), y)
-            bring_to(c, s[EPS])
+            bring_to(c, s.eps)
             derive(c, seed, y)
-        elif whole and left == 0.0 and s[EPS] == eps:
+        elif whole and left == 0.0 and s.eps == eps:
             return
 
 
@@ -220,20 +210,19 @@ def _first(c, eps, m, seed, y, tol, weight):  # type: ignore[no-untyped-def]
     """Go to the strain of the first sample, where relaxation terms carry nothing."""
     go_to(c, eps, 0.0, m, seed, y, tol, weight)
     for k in range(c.terms):
-        y[k] = -c.springs[c.results + OF_LAW]
+        y[k] = -c.springs.sigma
         for q in range(c.p):
             y[c.terms + k * c.p + q] = -c.common[q]
 
 
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
 def follow(  # type: ignore[no-untyped-def]
-    template, ints, floats, rows, heights, mass, reals, strains, time, out, log, seeds, branches,
-    slopes,
+    template, ints, floats, rows, heights, mass, reals, strains, time, out, log, samples
 ):  # fmt: skip
     """Follow one spring, without its dashpot, along strains from rest.
 
-    `branches` and `slopes` become those of the samples; `seeds` (n, 2) are derivatives of a shift
-    of the motion, see `plan.seeds`.
+    `samples` (n, 4) are derivatives by a shift of the motion, see `histories.at_samples`, then
+    branch and slope dσ/dε, which are filled.
     """
     c = begin_run(template, ints, floats, time, strains, out, log, rows, heights, mass, reals)
     s, t, tol, n, weight, m = c.springs, c.time, reals[3], c.samples, 0.0, c.batch
@@ -243,16 +232,16 @@ def follow(  # type: ignore[no-untyped-def]
         weight += s[RELAX + 2 * k] * min(1.0, lasts / s[RELAX + 2 * k + 1])
         m[2 + k * TABLE + OF_STEP] = -1.0
     bring_to(c, 0.0)
-    derive(c, start(seeds), y)
+    derive(c, start(samples), y)
     for j in range(n):
-        seed, eps = past(start(seeds), 2 * j), c.values[j]
+        seed, eps = past(start(samples), 4 * j), c.values[j]
         if j == 0:
             _first(c, eps, m, seed, y, tol, weight)
         else:
             go_to(c, eps, t[j] - t[j - 1], m, seed, y, tol, weight)
         sum_up(c, y, j)
-        branches[j], slopes[j] = int(s[BRANCH]), s[c.results + SLOPE]
+        samples[j, 2], samples[j, 3] = s.branch, s.slope
         if not m[0] < math.inf:
             for k in range(j, n):
-                out[0, 0, k], branches[k] = math.inf, int(s[BRANCH])
+                out[0, 0, k], samples[k, 2] = math.inf, s.branch
             return

@@ -9,59 +9,32 @@ chain").
 from __future__ import annotations
 
 from numba import cfunc, types
-from numba.extending import intrinsic
 
-from foamfit.solve.run import (
-    DRAGGED,
-    FIXED,
-    INTERNALS,
-    KIND,
-    NUMBERS,
-    PACE,
-    PARAMETERS,
-    RECORD,
-    TOP_SPEED,
-    VALUE,
-    VALUE_RATE,
-    X_AT,
-    Z_AT,
-    unpack,
-)
+from foamfit.solve.compiled.run import RECORD, numbers, spring, unpack
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled.contract import (
     BY,
     BY_HELD,
     BY_STRESS,
-    DRIFT,
     EPS,
-    ETA,
-    EVALUATE,
     EXPLICIT,
-    GAIN,
     INTERNAL,
-    OF_LAW,
     OPTIONS,
-    PER_HEIGHT,
-    RATE,
     REAL,
     REALS_AT,
     RELAX,
-    SETTLE,
-    SLOPE,
-    STEEP,
-    TANGENT,
-    TOTAL,
+    RESULTS,
     WHOLE,
     WHOLES_AT,
     X,
-    by_address,
     call_evaluate,
     call_number,
+    calling,
     inlined,
     inner,
     past,
-)  # fmt: skip
-from foamfit.springs.parameters import OWN_RELAXATION
+)
+from foamfit.springs.laws.record import OWN_RELAXATION
 
 #: record, group, state, rates, whether with derivatives, time since the piece began; returns S
 GROUP = REAL(WHOLES_AT, WHOLE, REALS_AT, REALS_AT, WHOLE, REAL)
@@ -72,16 +45,11 @@ PART, FLOW, FRICTION, JUMP, PATH, LOSE, SHARE, LOSSES, BEGIN_RAMP, END_RAMP = ra
 ONLY_DERIVATIVES = 2  # instead of 0 or 1 for `want`, where the values are known
 
 
-@intrinsic
-def _call_group(typing, where, c, g, y, f, want, at):  # type: ignore[no-untyped-def]
-    return REAL(WHOLE, RECORD, WHOLE, REALS_AT, REALS_AT, WHOLE, REAL), by_address
-
-
-@intrinsic
-def _call_inside(typing, where, c, task, i, up, y, f, quicker, out):  # type: ignore[no-untyped-def]
-    return types.void(
-        WHOLE, RECORD, WHOLE, WHOLE, WHOLE, REALS_AT, REALS_AT, REALS_AT, REALS_AT
-    ), by_address
+_call_group = calling(REAL, RECORD, WHOLE, REALS_AT, REALS_AT, WHOLE, REAL)
+_call_inside = calling(
+    types.void, RECORD, WHOLE, WHOLE, WHOLE, REALS_AT, REALS_AT, REALS_AT, REALS_AT
+)
+_call_rates = calling(types.void, RECORD, REALS_AT, REALS_AT, WHOLE, REAL, WHOLE)
 
 
 @inlined
@@ -96,76 +64,76 @@ def call_inside(c, task, i, up, y, f, quicker, out):  # type: ignore[no-untyped-
 @inner
 def evaluate(c, i, want):  # type: ignore[no-untyped-def]
     """Fill the results of the law of a spring at its strain and internal variables."""
-    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-    row, out = past(s, c.row), past(s, c.results)
-    call_evaluate(n[EVALUATE], row, s, past(s, EPS), past(s, X), 1, want, out)
+    s, n = spring(c, i), numbers(c, i)
+    row, out = past(s, c.row), past(s, RESULTS)
+    call_evaluate(n.evaluate, row, s, past(s, EPS), past(s, X), 1, want, out)
 
 
 @inner
 def follow_spring(c, i, eps, y, f, want):  # type: ignore[no-untyped-def]
     """Fill the values of a spring at a strain, and the rates of its relaxation terms; return T."""
-    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-    kind, out = n[KIND], past(s, c.results)
+    s, n = spring(c, i), numbers(c, i)
+    kind = n.kind
     if kind == BY_STRESS and c.solved:
-        call_number(n[SETTLE], past(s, c.row), s, eps)
+        call_number(n.settle, past(s, c.row), s, eps)
     elif kind != EXPLICIT:
-        for k in range(n[INTERNALS]):
-            s[X + k] = y[n[X_AT] + k]
-    s[EPS] = eps
-    evaluate(c, i, want if kind != INTERNAL or want else 2 * n[FIXED])
-    sigma, tangent, drift = out[OF_LAW], out[SLOPE], 0.0
-    if kind == INTERNAL and n[FIXED]:
+        for k in range(n.internals):
+            s[X + k] = y[n.x_at + k]
+    s.eps = eps
+    evaluate(c, i, want if kind != INTERNAL or want else 2 * n.fixed)
+    sigma, tangent, drift = s.sigma, s.slope, 0.0
+    if kind == INTERNAL and n.fixed:
         call_inside(c, PATH, i, c.none, y, f, y, y)
-        tangent, drift = s[TANGENT], s[DRIFT]
-    stress = s[GAIN] * sigma
+        tangent, drift = s.tangent, s.drift
+    stress = s.gain * sigma
     for k in range(c.terms):
-        z, at = y[n[Z_AT] + k], RELAX + 2 * k
+        z, at = y[n.z_at + k], RELAX + 2 * k
         dz = -(z + sigma) / s[at + 1]
-        f[n[Z_AT] + k] = dz
+        f[n.z_at + k] = dz
         stress += s[at] * z
         drift += s[at] * dz
-    s[TOTAL], s[DRIFT], s[TANGENT] = stress, drift, tangent
+    s.total, s.drift, s.tangent = stress, drift, tangent
     return stress
 
 
 @inner
 def move_inside(c, i, f):  # type: ignore[no-untyped-def]
     """Fill the rates of the internal variables of a spring."""
-    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-    if n[KIND] == BY_STRESS and not c.solved:
-        f[n[X_AT]] = s[c.results + SLOPE] * s[RATE]
-    elif n[KIND] == INTERNAL:
-        x, values = n[INTERNALS], past(s, c.results + BY + n[PARAMETERS])
+    s, n = spring(c, i), numbers(c, i)
+    if n.kind == BY_STRESS and not c.solved:
+        f[n.x_at] = s.slope * s.rate
+    elif n.kind == INTERNAL:
+        x, values = n.internals, past(s, RESULTS + BY + n.parameters)
         for k in range(x):
-            f[n[X_AT] + k] = values[2 + k] * s[RATE] + c.drive[PACE] * values[2 + x + k]
+            f[n.x_at + k] = values[2 + k] * s.rate + c.drive.pace * values[2 + x + k]
 
 
 @inner
 def derive_spring(c, i, y):  # type: ignore[no-untyped-def]
     """Fill the derivatives of the stress of a spring at fixed strain, and of T at fixed strain."""
-    s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
+    s, n, p = spring(c, i), numbers(c, i), c.p
     part, total = past(c.part, i * p), past(c.part, (c.count + i) * p)
-    out, owned, directions = past(s, c.results), c.owned, c.directions
-    s[STEEP] = s[TANGENT] if n[FIXED] else out[SLOPE]
+    out, owned, directions = past(s, RESULTS), c.owned, c.directions
+    s.steep = s.tangent if n.fixed else s.slope
     for j in range(p):
         part[j] = 0.0
-    if n[KIND] == BY_STRESS:
+    if n.kind == BY_STRESS:
         a, b, held = out[BY_HELD], out[BY_HELD + 1], past(c.held, 2 * i * p)
         for j in range(p):
             part[j] = a * held[j] + b * held[p + j]
-    elif n[KIND] == INTERNAL:
+    elif n.kind == INTERNAL:
         call_inside(c, PART, i, c.none, y, y, y, part)
     for k in range(owned[i], owned[i + 1]):
         part[owned[k]] += out[BY + directions[2 * owned[k] + 1]]
-    gain = s[GAIN]
+    gain = s.gain
     for j in range(p):
         total[j] = gain * part[j]
     for k in range(c.terms):
-        g, dz, of_g = s[RELAX + 2 * k], past(y, c.base + (n[Z_AT] + k) * p), OWN_RELAXATION + 2 * k
+        g, dz, of_g = s[RELAX + 2 * k], past(y, c.base + (n.z_at + k) * p), OWN_RELAXATION + 2 * k
         for j in range(p):
             total[j] += g * dz[j]
             if directions[2 * j] == i and directions[2 * j + 1] == of_g:
-                total[j] += out[OF_LAW] + y[n[Z_AT] + k]
+                total[j] += s.sigma + y[n.z_at + k]
 
 
 @inner
@@ -174,17 +142,17 @@ def derive_inside(c, i, y, f, quicker):  # type: ignore[no-untyped-def]
 
     `quicker` are the derivatives of the strain rate, for INTERNAL laws; not read if unknown.
     """
-    s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
-    part, strain, out = past(c.part, i * p), past(c.strain, i * p), past(s, c.results)
-    directions, slope = c.directions, s[STEEP]
+    s, n, p = spring(c, i), numbers(c, i), c.p
+    part, strain = past(c.part, i * p), past(c.strain, i * p)
+    directions, slope = c.directions, s.steep
     for k in range(c.terms):
-        at, per = c.base + (n[Z_AT] + k) * p, 1.0 / s[RELAX + 2 * k + 1]
-        more, of_tau = (y[n[Z_AT] + k] + out[OF_LAW]) * per * per, OWN_RELAXATION + 2 * k + 1
+        at, per = c.base + (n.z_at + k) * p, 1.0 / s[RELAX + 2 * k + 1]
+        more, of_tau = (y[n.z_at + k] + s.sigma) * per * per, OWN_RELAXATION + 2 * k + 1
         for j in range(p):
             f[at + j] = -per * (y[at + j] + slope * strain[j] + part[j])
             if directions[2 * j] == i and directions[2 * j + 1] == of_tau:
                 f[at + j] += more
-    if n[KIND] == INTERNAL:
+    if n.kind == INTERNAL:
         call_inside(c, FLOW, i, c.none, y, f, quicker, f)
 
 
@@ -196,7 +164,7 @@ def span_of(c, g, y, at):  # type: ignore[no-untyped-def]
     """Return elongation and its rate of a group, as far as its nodes tell."""
     last = g == c.groups - 1
     if last and c.top == MOTION:
-        reach, rate = c.drive[VALUE] + c.drive[VALUE_RATE] * at, c.drive[VALUE_RATE]
+        reach, rate = c.drive.value + c.drive.value_rate * at, c.drive.value_rate
     elif last and c.top == STRESS:
         reach = rate = 0.0
     else:
@@ -238,13 +206,13 @@ def span_tangents(c, g, y, reach, rate):  # type: ignore[no-untyped-def]
 @inner
 def _follow_one(c, g, i, y, f, want, at):  # type: ignore[no-untyped-def]
     """Fill the values of a spring between two nodes, and their part of the rates; return S."""
-    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+    s, n = spring(c, i), numbers(c, i)
     reach, rate = span_of(c, g, y, at)
-    s[RATE] = rate = rate * s[PER_HEIGHT]
-    common = follow_spring(c, i, reach * s[PER_HEIGHT], y, f, want) + s[ETA] * rate
+    s.rate = rate = rate * s.per_height
+    common = follow_spring(c, i, reach * s.per_height, y, f, want) + s.eta * rate
     move_inside(c, i, f)
-    if n[KIND] == INTERNAL:
-        common += c.drive[PACE] * s[c.results + BY + n[PARAMETERS] + 1]
+    if n.kind == INTERNAL:
+        common += c.drive.pace * s[RESULTS + BY + n.parameters + 1]
     c.carried[g] = common
     return common
 
@@ -257,15 +225,15 @@ def _derive_one(c, g, i, y, f):  # type: ignore[no-untyped-def]
     reach, rate = past(c.common, (c.groups + 1) * p), past(c.common, (c.groups + 2) * p)
     span_tangents(c, g, y, reach, rate)
     derive_spring(c, i, y)
-    s, own, strain = past(c.springs, i * c.width), past(c.own, 2 * i * p), past(c.strain, i * p)
-    per, eta, total = s[PER_HEIGHT], s[ETA], past(c.part, (c.count + i) * p)
-    slope, eps, faster = s[c.results + SLOPE] * s[GAIN], s[EPS], s[RATE]
+    s, own, strain = spring(c, i), past(c.own, 2 * i * p), past(c.strain, i * p)
+    per, eta, total = s.per_height, s.eta, past(c.part, (c.count + i) * p)
+    slope, eps, faster = s.slope * s.gain, s.eps, s.rate
     for j in range(p):
         strain[j] = (reach[j] - eps * own[j]) * per
         rate[j] = (rate[j] - faster * own[j]) * per
         out[j] = slope * strain[j] + total[j] + own[p + j] * faster + eta * rate[j]
     derive_inside(c, i, y, f, rate)
-    if c.numbers[i * NUMBERS + KIND] == INTERNAL:
+    if numbers(c, i).kind == INTERNAL:
         call_inside(c, FRICTION, i, c.none, y, f, rate, out)
 
 
@@ -278,8 +246,8 @@ def _accelerate(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
     p, last = c.p, g == c.groups - 1
     v, per, drag = y[2 * g + 1], c.per_mass[g], 0.0
     if last:
-        drag = c.drive[DRAGGED]
-        force = c.drive[VALUE] + c.drive[VALUE_RATE] * at - c.carried[g] - drag * v
+        drag = c.drive.dragged
+        force = c.drive.value + c.drive.value_rate * at - c.carried[g] - drag * v
     else:
         force = c.carried[g + 1] - c.carried[g]
     f[2 * g], f[2 * g + 1] = v, force * per
@@ -315,17 +283,12 @@ def _rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
         return
     for g in range(c.nodes):
         if g == c.groups - 1 and c.top == VISCOUS:
-            f[2 * g], f[2 * g + 1] = c.drive[TOP_SPEED], 0.0
+            f[2 * g], f[2 * g + 1] = c.drive.top_speed, 0.0
         else:
             _accelerate(c, g, y, f, want, at)
 
 
 RATES = _rates.address
-
-
-@intrinsic
-def _call_rates(typing, where, c, y, f, want, at, only):  # type: ignore[no-untyped-def]
-    return types.void(WHOLE, RECORD, REALS_AT, REALS_AT, WHOLE, REAL, WHOLE), by_address
 
 
 @inlined

@@ -17,7 +17,7 @@ from numba import cfunc
 from scipy.integrate import RK23
 from scipy.integrate._ivp import dop853_coefficients as pair
 
-from foamfit.solve.events import (
+from foamfit.solve.compiled.events import (
     DOUBTFUL,
     FAILED,
     MIDDLE,
@@ -27,9 +27,9 @@ from foamfit.solve.events import (
     keep_midway,
     suspicious,
 )
-from foamfit.solve.motion import rates
-from foamfit.solve.run import GROW, HORIZON, LAST, NOW, PAUSED, STEP, STEPPED, TAKEN, unpack
-from foamfit.springs.compiled.contract import MIDWAY, OPTIONS, RATE, RELAX, inner, past
+from foamfit.solve.compiled.motion import rates
+from foamfit.solve.compiled.run import STEPPED, spring, unpack
+from foamfit.springs.compiled.contract import OPTIONS, RELAX, inner, past
 
 ALL_STAGES = 16  # those of a step and of the dense output
 _A = np.zeros((ALL_STAGES, ALL_STAGES))
@@ -116,7 +116,7 @@ def take_short(c, n, dt, at, want, tol):  # type: ignore[no-untyped-def]
     """Take a step of order 3 as `take` does; return its error over the tolerance."""
     y, new, scales, errors, wide = c.y, c.new, c.scales, c.errors, c.wide
     for i in range(c.count):
-        s = past(c.springs, i * c.width)
+        s = spring(c, i)
         for k in range(c.terms):
             if s[RELAX + 2 * k] > 0.0 and dt > s[RELAX + 2 * k + 1]:  # derivatives would grow
                 return math.inf
@@ -125,9 +125,9 @@ def take_short(c, n, dt, at, want, tol):  # type: ignore[no-untyped-def]
         combine(c, n, SHORT + q, dt, y, target)
         rates(c, target, past(c.stage, row * wide), want, at + SHORT_TIMES[q] * dt)
         for i in range(c.count):
-            s = past(c.springs, i * c.width)
+            s = spring(c, i)
             if q < 2:  # at MIDDLE, by a straight line between the stages
-                s[MIDWAY] = s[RATE] if q == 0 else s[MIDWAY] + BETWEEN * (s[RATE] - s[MIDWAY])
+                s.midway = s.rate if q == 0 else s.midway + BETWEEN * (s.rate - s.midway)
     combine(c, c.base, SHORT + 3, dt, c.nil, errors)
     total = 0.0
     for i in range(c.base):
@@ -188,42 +188,42 @@ def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
     """
     c = unpack(words)
     r, again, n = c.now, False, c.base + c.carries * c.p
-    if upto == math.inf and r[NOW] == 0.0 and r[STEP] == r[HORIZON] and r[STEP] > 0.0:
-        r[PAUSED] -= 1.0
-        if r[PAUSED] < 0.0:
-            if take_short(c, n, r[STEP], r[NOW], want, tol) <= 1.0 and not suspicious(c, r[STEP]):
-                r[TAKEN], r[GROW] = r[TAKEN] + 1.0, 6.0
+    if upto == math.inf and r.now == 0.0 and r.step == r.horizon and r.step > 0.0:
+        r.paused -= 1.0
+        if r.paused < 0.0:
+            if take_short(c, n, r.step, r.now, want, tol) <= 1.0 and not suspicious(c, r.step):
+                r.taken, r.grow = r.taken + 1.0, 6.0
                 return PLAIN
-            r[PAUSED] = PAUSE
+            r.paused = PAUSE
     while True:
-        dt, at = r[STEP], r[NOW]
-        if r[NOW] + dt == r[NOW] or not dt > 0.0:
+        dt, at = r.step, r.now
+        if r.now + dt == r.now or not dt > 0.0:
             return FAILED
         take(c, n, dt, at, want)
-        r[TAKEN] += 1.0
+        r.taken += 1.0
         error = error_of(c, dt, tol)
         if not error <= 1.0:
             again = True
-            r[STEP] = dt * (max(0.2, 0.9 * error**-0.125) if error < math.inf else 0.2)
-            if r[TAKEN] >= most:
+            r.step = dt * (max(0.2, 0.9 * error**-0.125) if error < math.inf else 0.2)
+            if r.taken >= most:
                 return FAILED
             continue
         grow = 6.0
         if error > 1e-8:
-            grow = min(6.0, max(0.3, 0.9 * error**-0.115 * r[LAST] ** 0.02))
-        r[GROW] = min(grow, 1.0) if again else grow
+            grow = min(6.0, max(0.3, 0.9 * error**-0.115 * r.last**0.02))
+        r.grow = min(grow, 1.0) if again else grow
         doubtful = suspicious(c, dt)
-        if not doubtful and upto > r[NOW] + dt:
-            r[LAST] = max(error, 1e-4)
+        if not doubtful and upto > r.now + dt:
+            r.last = max(error, 1e-4)
             return PLAIN
         size = make_dense(c, n, dt, at, tol, want)
-        if size > 1.0 and dt > 1e-12 * abs(r[HORIZON]):
+        if size > 1.0 and dt > 1e-12 * abs(r.horizon):
             again = True
-            r[STEP] = dt * max(0.3, 0.9 * size**-0.143)
+            r.step = dt * max(0.3, 0.9 * size**-0.143)
             continue
-        r[LAST] = max(error, 1e-4)
+        r.last = max(error, 1e-4)
         if size > 0.0:
-            r[GROW] = min(r[GROW], 0.9 * size**-0.143)
+            r.grow = min(r.grow, 0.9 * size**-0.143)
         return DOUBTFUL if doubtful else SAMPLED
 
 

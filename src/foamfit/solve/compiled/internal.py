@@ -19,7 +19,7 @@ import math
 
 from numba import cfunc
 
-from foamfit.solve.motion import (
+from foamfit.solve.compiled.motion import (
     BEGIN_RAMP,
     END_RAMP,
     FLOW,
@@ -33,55 +33,20 @@ from foamfit.solve.motion import (
     evaluate,
     rates,
 )
-from foamfit.solve.run import (
-    BEGUN,
-    DRAGGED,
-    EPS_AT,
-    FIXED,
-    GROW,
-    HORIZON,
-    INTERNALS,
-    KIND,
-    NOW,
-    NUMBERS,
-    PACE,
-    PARAMETERS,
-    PIECE,
-    PUSH,
-    SPREAD,
-    TOP_SPEED,
-    VALUE,
-    VALUE_RATE,
-    X_AT,
-    Z_AT,
-    unpack,
-)
+from foamfit.solve.compiled.run import numbers, spring, unpack
 from foamfit.solve.scene import MOTION, VISCOUS
 from foamfit.springs.compiled.contract import (
     BY,
-    DRIFT,
-    EPS,
-    ETA,
-    GAIN,
-    HEIGHT,
     INTERNAL,
-    LOSS,
-    LOSSY,
-    OF_LAW,
     OPTIONS,
-    RATE,
     RELAX,
-    SLOPE,
-    STEEP,
-    SWITCH,
-    TANGENT,
-    TOTAL,
+    RESULTS,
     X,
     call_switch,
     inner,
     past,
-)  # fmt: skip
-from foamfit.springs.parameters import OWN_ETA
+)
+from foamfit.springs.laws.record import OWN_ETA
 
 LEAST_RATE = 1e-25  # smaller strain rates are zero, 1/s
 ENOUGH = 2e-15  # relative change of a rate or stress that ends Newton's method
@@ -91,14 +56,14 @@ RAMP = 1e-9  # time of a ramp to the first sample over the duration
 @inner
 def _path(c, i):  # type: ignore[no-untyped-def]
     """Fill dσ/dε along the path of the internal variables, and what their rates B add to dT/dt."""
-    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-    x, values = n[INTERNALS], past(s, c.results + BY + n[PARAMETERS])
-    size, tangent, drift = 2 + 2 * x, s[c.results + SLOPE], 0.0
+    s, n = spring(c, i), numbers(c, i)
+    x, values = n.internals, past(s, RESULTS + BY + n.parameters)
+    size, tangent, drift = 2 + 2 * x, s.slope, 0.0
     for k in range(x):
         by_x = values[size + (2 + k) * size]
         tangent += by_x * values[2 + k]
-        drift += c.drive[PACE] * s[GAIN] * by_x * values[2 + x + k]
-    s[TANGENT], s[DRIFT] = tangent, drift
+        drift += c.drive.pace * s.gain * by_x * values[2 + x + k]
+    s.tangent, s.drift = tangent, drift
 
 
 # ---------------------------------------------------------------- derivatives
@@ -107,11 +72,11 @@ def _path(c, i):  # type: ignore[no-untyped-def]
 @inner
 def _part(c, i, y, part):  # type: ignore[no-untyped-def]
     """Add the derivatives of the stress through the internal variables."""
-    s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
-    size = 2 + 2 * n[INTERNALS]
-    for k in range(n[INTERNALS]):
-        by_x = s[c.results + BY + n[PARAMETERS] + size + (2 + k) * size]
-        d_x = past(y, c.base + (n[X_AT] + k) * p)
+    s, n, p = spring(c, i), numbers(c, i), c.p
+    size = 2 + 2 * n.internals
+    for k in range(n.internals):
+        by_x = s[RESULTS + BY + n.parameters + size + (2 + k) * size]
+        d_x = past(y, c.base + (n.x_at + k) * p)
         for j in range(p):
             part[j] += by_x * d_x[j]
 
@@ -119,13 +84,13 @@ def _part(c, i, y, part):  # type: ignore[no-untyped-def]
 @inner
 def _flow(c, i, y, f, quicker):  # type: ignore[no-untyped-def]
     """Fill the rates of the derivatives of the internal variables."""
-    s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
-    x, values, strain = n[INTERNALS], past(s, c.results + BY + n[PARAMETERS]), past(c.strain, i * p)
-    size, rate, pace, fixed = 2 + 2 * x, s[RATE], c.drive[PACE], n[FIXED]
+    s, n, p = spring(c, i), numbers(c, i), c.p
+    x, values, strain = n.internals, past(s, RESULTS + BY + n.parameters), past(c.strain, i * p)
+    size, rate, pace, fixed = 2 + 2 * x, s.rate, c.drive.pace, n.fixed
     by = past(values, size)
     for k in range(x):
         a, b = 2 + k, 2 + x + k
-        at, by_strain = c.base + (n[X_AT] + k) * p, pace * by[b]
+        at, by_strain = c.base + (n.x_at + k) * p, pace * by[b]
         if fixed:
             for m in range(x):
                 column = past(by, (2 + m) * size)
@@ -135,7 +100,7 @@ def _flow(c, i, y, f, quicker):  # type: ignore[no-untyped-def]
         for j in range(p):
             f[at + j] = by_strain * strain[j] + (0.0 if fixed else values[a] * quicker[j])
         for m in range(x):
-            column, d_x = past(by, (2 + m) * size), past(y, c.base + (n[X_AT] + m) * p)
+            column, d_x = past(by, (2 + m) * size), past(y, c.base + (n.x_at + m) * p)
             for j in range(p):
                 f[at + j] += (rate * column[a] + pace * column[b]) * d_x[j]
         for m in range(c.owned[i], c.owned[i + 1]):
@@ -147,18 +112,18 @@ def _flow(c, i, y, f, quicker):  # type: ignore[no-untyped-def]
 @inner
 def _friction(c, i, y, quicker, out):  # type: ignore[no-untyped-def]
     """Add the derivatives of the stress V."""
-    s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
-    strain, size, pace = past(c.strain, i * p), 2 + 2 * n[INTERNALS], c.drive[PACE]
-    by = past(s, c.results + BY + n[PARAMETERS] + size)
+    s, n, p = spring(c, i), numbers(c, i), c.p
+    strain, size, pace = past(c.strain, i * p), 2 + 2 * n.internals, c.drive.pace
+    by = past(s, RESULTS + BY + n.parameters + size)
     for j in range(p):
         out[j] += pace * (by[1] * strain[j] + by[size + 1] * quicker[j])
-    for k in range(n[INTERNALS]):
-        d_x = past(y, c.base + (n[X_AT] + k) * p)
+    for k in range(n.internals):
+        d_x = past(y, c.base + (n.x_at + k) * p)
         for j in range(p):
             out[j] += pace * by[(2 + k) * size + 1] * d_x[j]
     for m in range(c.owned[i], c.owned[i + 1]):
         j = c.owned[m]
-        out[j] += pace * by[(2 + n[INTERNALS] + c.directions[2 * j + 1]) * size + 1]
+        out[j] += pace * by[(2 + n.internals + c.directions[2 * j + 1]) * size + 1]
 
 
 @inner
@@ -167,32 +132,32 @@ def _jump(c, i, up, y):  # type: ignore[no-untyped-def]
 
     Their rates may jump too, so that the delay of the instant of the change counts.
     """
-    s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
-    x, pace = n[INTERNALS], c.drive[PACE]
-    changes = past(s, c.results + BY + n[PARAMETERS] + 2 + 2 * x)  # instead of derivatives
+    s, n, p = spring(c, i), numbers(c, i), c.p
+    x, pace = n.internals, c.drive.pace
+    changes = past(s, RESULTS + BY + n.parameters + 2 + 2 * x)  # instead of derivatives
     for k in range(x):
-        s[X + k] = y[n[X_AT] + k]
-    call_switch(n[SWITCH], past(s, c.row), s, up, changes)
+        s[X + k] = y[n.x_at + k]
+    call_switch(n.switch, past(s, c.row), s, up, changes)
     for k in range(x):
-        y[n[X_AT] + k] = s[X + k]
+        y[n.x_at + k] = s[X + k]
     if p == 0:
         return
-    wide, first = 1 + x + n[PARAMETERS], past(s, c.results + BY + n[PARAMETERS] + 2)  # A, then B
+    wide, first = 1 + x + n.parameters, past(s, RESULTS + BY + n.parameters + 2)  # A, then B
     end, out = past(changes, x * wide), past(changes, (x + 1) * wide)
-    faster = s[RATE] * (1.0 - end[0])  # of the strain past the end
+    faster = s.rate * (1.0 - end[0])  # of the strain past the end
     for k in range(x):
-        faster -= end[1 + k] * (s[RATE] * first[k] + pace * first[x + k])
+        faster -= end[1 + k] * (s.rate * first[k] + pace * first[x + k])
     delays = past(c.common, (c.groups + 1) * p)
     for j in range(p):
         strain, late = c.strain[i * p + j], 0.0
         own = c.directions[2 * j + 1] if c.directions[2 * j] == i else OWN_ETA
         for k in range(x + 1):  # of the end, then of the internal variables at the instant
             by = end if k == 0 else past(changes, (k - 1) * wide)
-            value = by[0] * (strain + s[RATE] * late if k > 0 else strain)
+            value = by[0] * (strain + s.rate * late if k > 0 else strain)
             for m in range(x):
-                d_x = y[c.base + (n[X_AT] + m) * p + j] + (first[m] * strain if n[FIXED] else 0.0)
+                d_x = y[c.base + (n.x_at + m) * p + j] + (first[m] * strain if n.fixed else 0.0)
                 if k > 0:
-                    d_x += (s[RATE] * first[m] + pace * first[x + m]) * late
+                    d_x += (s.rate * first[m] + pace * first[x + m]) * late
                 value += by[1 + m] * d_x
             if own < OWN_ETA:
                 value += by[1 + x + own]
@@ -202,13 +167,13 @@ def _jump(c, i, up, y):  # type: ignore[no-untyped-def]
                 out[k - 1] = value
         delays[j] = late
         for k in range(x):
-            y[c.base + (n[X_AT] + k) * p + j] = out[k]
+            y[c.base + (n.x_at + k) * p + j] = out[k]
     evaluate(c, i, c.none)  # on the next branch
     for j in range(p):
-        strain = c.strain[i * p + j] if n[FIXED] else 0.0
+        strain = c.strain[i * p + j] if n.fixed else 0.0
         for k in range(x):
-            moved = first[k] * (strain + s[RATE] * delays[j]) + pace * first[x + k] * delays[j]
-            y[c.base + (n[X_AT] + k) * p + j] -= moved
+            moved = first[k] * (strain + s.rate * delays[j]) + pace * first[x + k] * delays[j]
+            y[c.base + (n.x_at + k) * p + j] -= moved
 
 
 # ---------------------------------------------------------------- the stress V in a group
@@ -220,26 +185,26 @@ def _lose(c, i, common):  # type: ignore[no-untyped-def]
 
     Newton's method in logarithms inside a bracket: it takes one step for a power of the rate.
     """
-    s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-    force, s[LOSS] = common - s[TOTAL], s[ETA]
-    if s[LOSSY] == 0.0:
-        s[RATE] = force / s[ETA]
+    s, n = spring(c, i), numbers(c, i)
+    force, s.loss = common - s.total, s.eta
+    if s.lossy == 0.0:
+        s.rate = force / s.eta
         return
-    sign, rate, low, high = 1.0 if force > 0.0 else -1.0, abs(s[RATE]), 0.0, math.inf
-    values = past(s, c.results + BY + n[PARAMETERS])
+    sign, rate, low, high = 1.0 if force > 0.0 else -1.0, abs(s.rate), 0.0, math.inf
+    values = past(s, RESULTS + BY + n.parameters)
     rate = rate if rate > 0.0 else 1.0
     for _ in range(200):
-        s[RATE] = sign * rate if force != 0.0 else 0.0
+        s.rate = sign * rate if force != 0.0 else 0.0
         evaluate(c, i, 2 + c.none)
-        value = sign * (values[1] + s[ETA] * s[RATE])
-        s[LOSS] = s[ETA] + values[2 * (2 + 2 * n[INTERNALS]) + 1]
+        value = sign * (values[1] + s.eta * s.rate)
+        s.loss = s.eta + values[2 * (2 + 2 * n.internals) + 1]
         if force == 0.0:  # at rest, where the derivative of a power is infinite or zero
-            s[LOSS] = math.inf
+            s.loss = math.inf
             return
         low, high = (low, rate) if value >= abs(force) else (rate, high)
         new = -1.0
-        if value > 0.0 and s[LOSS] > 0.0:
-            new = rate * (abs(force) / value) ** (value / (s[LOSS] * rate))
+        if value > 0.0 and s.loss > 0.0:
+            new = rate * (abs(force) / value) ** (value / (s.loss * rate))
         if abs(new - rate) <= ENOUGH * rate:
             return
         if not low < new < high:
@@ -261,18 +226,18 @@ def _share(c, g):  # type: ignore[no-untyped-def]
     hardly differ.
     """
     i0, i1 = (c.ends[g - 1] if g > 0 else 0), c.ends[g]
-    push, rate, low, high = c.drive[PUSH], c.drive[SPREAD], -math.inf, math.inf
-    drag = c.drive[DRAGGED] if g == c.groups - 1 and c.top == VISCOUS else 0.0
-    now = c.carried[g] if drag == 0.0 else -c.drive[TOP_SPEED]
+    push, rate, low, high = c.drive.push, c.drive.spread, -math.inf, math.inf
+    drag = c.drive.dragged if g == c.groups - 1 and c.top == VISCOUS else 0.0
+    now = c.carried[g] if drag == 0.0 else -c.drive.top_speed
     now = now if abs(now) < math.inf else 0.0
     for _ in range(200):
         common = now if drag == 0.0 else push + drag * now
         miss, soft = -rate, 0.0
         for i in range(i0, i1):
-            s = past(c.springs, i * c.width)
+            s = spring(c, i)
             _lose(c, i, common)
-            miss += s[HEIGHT] * s[RATE]
-            soft += s[HEIGHT] / s[LOSS]
+            miss += s.height * s.rate
+            soft += s.height / s.loss
         if drag > 0.0:
             miss, soft = miss + now, soft * drag + 1.0
         low, high = (low, now) if miss > 0.0 else (now, high)
@@ -289,13 +254,13 @@ def _share(c, g):  # type: ignore[no-untyped-def]
         now = new
     c.carried[g] = common
     if drag > 0.0:
-        c.drive[TOP_SPEED] = -now
+        c.drive.top_speed = -now
 
 
 @inner
 def _losses(c, i, y, out):  # type: ignore[no-untyped-def]
     """Add the derivatives of V of a spring in a group, at the strain rate that it has found."""
-    p, at = c.p, c.numbers[i * NUMBERS + EPS_AT]
+    p, at = c.p, numbers(c, i).eps_at
     for j in range(p):
         c.strain[i * p + j] = y[c.base + at * p + j]
     evaluate(c, i, 1 + c.none)
@@ -310,19 +275,19 @@ def _begin_ramp(c, want):  # type: ignore[no-untyped-def]
     """Begin a ramp to the first sample of a drive. Under a prescribed stress dashpots are rigid."""
     r, drive, t, terms = c.now, c.drive, c.time, c.terms
     brief = RAMP * (t[c.samples - 1] - t[0]) if c.samples > 1 else RAMP
-    r[NOW], r[BEGUN], r[HORIZON], r[PIECE] = 0.0, t[0] - brief, brief, -1.0
+    r.now, r.begun, r.horizon, r.piece = 0.0, t[0] - brief, brief, -1.0
     aside, masses = c.aside, past(c.aside, c.count * (1 + terms))
     for g in range(c.groups):
         masses[g], c.per_mass[g] = c.per_mass[g], 0.0
-    masses[c.groups] = drive[PACE]
-    drive[VALUE], drive[VALUE_RATE], drive[PACE] = 0.0, c.values[0] / brief, 0.0
+    masses[c.groups] = drive.pace
+    drive.value, drive.value_rate, drive.pace = 0.0, c.values[0] / brief, 0.0
     for i in range(c.ends[c.groups - 2] if c.groups > 1 else c.none, c.count):
-        s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+        s, n = spring(c, i), numbers(c, i)
         kept = past(aside, i * (1 + terms))
-        kept[0], s[GAIN] = s[ETA], 1.0
-        if s[ETA] > 0.0:
-            s[ETA] = s[LOSS] = 0.0 if c.top == MOTION else math.inf
-            n[FIXED] = int(c.top == MOTION and n[EPS_AT] >= 0)
+        kept[0], s.gain = s.eta, 1.0
+        if s.eta > 0.0:
+            s.eta = s.loss = 0.0 if c.top == MOTION else math.inf
+            n.fixed = int(c.top == MOTION and n.eps_at >= 0)
         for k in range(terms):
             kept[1 + k], s[RELAX + 2 * k] = s[RELAX + 2 * k], 0.0
     rates(c, c.y, c.stage, want, 0.0)
@@ -333,32 +298,32 @@ def _end_ramp(c, want):  # type: ignore[no-untyped-def]
     """Let time pass again: relaxation terms begin at zero, and dashpots at the present strain."""
     y, p, terms = c.y, c.p, c.terms
     aside, masses = c.aside, past(c.aside, c.count * (1 + terms))
-    rates(c, y, c.stage, want, c.now[NOW])
-    c.drive[PACE], c.now[GROW] = masses[c.groups], 1.0
+    rates(c, y, c.stage, want, c.now.now)
+    c.drive.pace, c.now.grow = masses[c.groups], 1.0
     for g in range(c.groups):
         c.per_mass[g] = masses[g]
     for i in range(c.ends[c.groups - 2] if c.groups > 1 else c.none, c.count):
-        s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+        s, n = spring(c, i), numbers(c, i)
         kept = past(aside, i * (1 + terms))
         strain, part = past(c.strain, i * p), past(c.part, i * p)
         for k in range(terms):
             s[RELAX + 2 * k] = kept[1 + k]
-            s[GAIN] += kept[1 + k]
-            y[n[Z_AT] + k] = -s[c.results + OF_LAW]
+            s.gain += kept[1 + k]
+            y[n.z_at + k] = -s.sigma
             for j in range(p):
-                y[c.base + (n[Z_AT] + k) * p + j] = -(s[STEEP] * strain[j] + part[j])
+                y[c.base + (n.z_at + k) * p + j] = -(s.steep * strain[j] + part[j])
         if kept[0] == 0.0:
             continue
-        s[ETA] = s[LOSS] = kept[0]
-        if n[EPS_AT] >= 0 and c.top == MOTION:
-            y[n[EPS_AT]] = s[EPS]
+        s.eta = s.loss = kept[0]
+        if n.eps_at >= 0 and c.top == MOTION:
+            y[n.eps_at] = s.eps
             for j in range(p):
-                y[c.base + n[EPS_AT] * p + j] = strain[j]
-        if n[FIXED]:
-            first, n[FIXED] = past(s, c.results + BY + n[PARAMETERS] + 2), 0
-            for k in range(n[INTERNALS] if n[KIND] == INTERNAL else c.none):
+                y[c.base + n.eps_at * p + j] = strain[j]
+        if n.fixed:
+            first, n.fixed = past(s, RESULTS + BY + n.parameters + 2), 0
+            for k in range(n.internals if n.kind == INTERNAL else c.none):
                 for j in range(p):
-                    y[c.base + (n[X_AT] + k) * p + j] += first[k] * strain[j]
+                    y[c.base + (n.x_at + k) * p + j] += first[k] * strain[j]
 
 
 @cfunc(INSIDE, **OPTIONS, cache=True)

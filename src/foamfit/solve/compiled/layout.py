@@ -9,25 +9,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.solve.run import (
+from foamfit.solve.compiled.run import (
     BATCH,
-    DRIVES,
-    EPS_AT,
-    FIXED,
+    DRIVE,
     FLOATS,
     GIVEN,
-    INTERNALS,
-    KIND,
     LINE,
+    NOW,
     NUMBERS,
     OF_SIGMA,
-    RUN,
     SCALES,
     STAGES,
     SYSTEMS,
     WORDS,
-    X_AT,
-    Z_AT,
 )
 from foamfit.solve.scene import FREE, STRESS, VISCOUS
 from foamfit.springs.compiled import compiled
@@ -39,8 +33,7 @@ from foamfit.springs.compiled.contract import (
     RESULTS,
     results_of,
 )
-from foamfit.springs.laws.record import Law
-from foamfit.springs.parameters import OWN_ETA
+from foamfit.springs.laws.record import OWN_ETA, Law
 
 
 class Layout(NamedTuple):
@@ -69,7 +62,7 @@ def _groups(shape: Shape) -> list[range]:
     return [range(i, j) for i, j in pairwise((0, *shape.ends))]
 
 
-def place_state(shape: Shape, numbers: NDArray[np.int64], nodes: int) -> tuple[list[int], int]:
+def place_state(shape: Shape, numbers: np.recarray, nodes: int) -> tuple[list[int], int]:
     """Give every component its place; return the kinds, and how many have derivatives."""
     damped = np.frombuffer(shape.damped, bool)
     more, count = SCALES + len(shape.laws) + 2 * nodes, len(shape.laws)
@@ -82,29 +75,29 @@ def place_state(shape: Shape, numbers: NDArray[np.int64], nodes: int) -> tuple[l
         for i in springs:
             several[i] = not alone
     for i, own in enumerate(numbers):
-        own[EPS_AT] = own[X_AT] = -1
-        own[FIXED] = several[i] and not damped[i]
+        own.eps_at = own.x_at = -1
+        own.fixed = several[i] and not damped[i]
         if several[i] and damped[i]:
-            own[EPS_AT] = len(kinds)
+            own.eps_at = len(kinds)
             kinds.append(SCALES + i)
-        own[Z_AT] = len(kinds)
+        own.z_at = len(kinds)
         kinds += [OF_SIGMA] * shape.terms
-        if own[KIND] == INTERNAL:
-            own[X_AT], inside = len(kinds), int(own[INTERNALS])
+        if own.kind == INTERNAL:
+            own.x_at, inside = len(kinds), int(own.internals)
             kinds += range(more, more + inside)
             more += inside
     carries = len(kinds)
     for i, own in enumerate(numbers):
-        if not shape.solved and several[i] and own[EPS_AT] < 0:
-            own[EPS_AT] = len(kinds)
+        if not shape.solved and several[i] and own.eps_at < 0:
+            own.eps_at = len(kinds)
             kinds.append(SCALES + i)
-        if not shape.solved and own[KIND] == BY_STRESS:
-            own[X_AT] = len(kinds)
+        if not shape.solved and own.kind == BY_STRESS:
+            own.x_at = len(kinds)
             kinds.append(OF_SIGMA)
     return kinds, carries
 
 
-def order(shape: Shape, numbers: NDArray[np.int64], nodes: int) -> tuple[list[int], list[int], int]:
+def order(shape: Shape, numbers: np.recarray, nodes: int) -> tuple[list[int], list[int], int]:
     """Order the components by groups: return place and group of each, and the reach.
 
     Components couple with those of the neighbouring groups: at places closer than the reach.
@@ -116,11 +109,11 @@ def order(shape: Shape, numbers: NDArray[np.int64], nodes: int) -> tuple[list[in
         one = [2 * g, 2 * g + 1] if g < nodes else []
         for i in springs:
             own = numbers[i]
-            if own[EPS_AT] >= 0 and damped[i]:
-                one.append(int(own[EPS_AT]))
-            one += range(int(own[Z_AT]), int(own[Z_AT]) + shape.terms)
-            if own[KIND] == INTERNAL:
-                one += range(int(own[X_AT]), int(own[X_AT] + own[INTERNALS]))
+            if own.eps_at >= 0 and damped[i]:
+                one.append(int(own.eps_at))
+            one += range(int(own.z_at), int(own.z_at) + shape.terms)
+            if own.kind == INTERNAL:
+                one += range(int(own.x_at), int(own.x_at + own.internals))
         found += [(k, g) for k in one]
         sizes.append(len(one))
     places, groups = [0] * len(found), [0] * len(found)
@@ -144,31 +137,31 @@ def _functions(shape: Shape, integrated: bool, several: bool, internal: bool) ->
 
     A function is compiled when its module is first imported.
     """
-    from foamfit.solve import events, motion
+    from foamfit.solve.compiled import events, motion
 
     group = inside = step = drive = write = 0
     if several:
-        from foamfit.solve import groups
+        from foamfit.solve.compiled import groups
 
         group = groups.GROUP_AT
     if internal:
-        from foamfit.solve import internal as inner
+        from foamfit.solve.compiled import internal as inner
 
         inside = inner.INSIDE_AT
     if integrated:
-        from foamfit.solve import samples
+        from foamfit.solve.compiled import samples
 
         write = samples.WRITE
         if shape.degree:
-            from foamfit.solve import implicit
+            from foamfit.solve.compiled import implicit
 
             step = implicit.IMPLICIT_STEP
         else:
-            from foamfit.solve import explicit
+            from foamfit.solve.compiled import explicit
 
             step = explicit.EXPLICIT_STEP
     if integrated and not shape.struck:
-        from foamfit.solve import drive as driven
+        from foamfit.solve.compiled import drive as driven
 
         drive = driven.DRIVE
     return motion.RATES, group, inside, events.CHANGE, step, drive, write
@@ -181,9 +174,10 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     directions = np.frombuffer(shape.directions, np.int64).reshape(-1, 2).tolist()
     count, groups, p = len(made), len(shape.ends), len(directions)
     nodes = groups if shape.top in (FREE, VISCOUS) else groups - 1
-    numbers = np.zeros((count, NUMBERS), np.int64)
-    for own, one in zip(numbers, made, strict=True):
-        own[: KIND + 3] = *one.addresses, one.kind, one.derivatives, one.internal
+    numbers = np.array(
+        [(*one.addresses, one.kind, one.derivatives, one.internal, 0, 0, 0, 0) for one in made],
+        [(name, np.int64) for name in NUMBERS],
+    ).view(np.recarray)
     kinds, carries = place_state(shape, numbers, nodes)
     base, internals = len(kinds), sum(one.internal for one in made)
     n = base + carries * p
@@ -195,12 +189,12 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     parameters = max(one.derivatives for one in made)
     internal = any(one.kind == INTERNAL for one in made)
     lengths = {
-        "springs": count * width, "per_mass": groups, "drive": DRIVES, "carried": groups,
+        "springs": count * width, "per_mass": groups, "drive": len(DRIVE), "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
         "common": (groups + 3) * p, "strain": count * p,
         "scales": SCALES + count + 2 * nodes + internals,
-        "now": RUN, "sided": p, "stage": STAGES * wide, "line": LINE * wide, "y": wide, "new": wide,
-        "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
+        "now": len(NOW), "sided": p, "stage": STAGES * wide, "line": LINE * wide, "y": wide,
+        "new": wide, "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
         "batch": BATCH * (6 + BY + parameters) + 3 * p + MOST_TERMS * (9 + p),
         "aside": count * (1 + shape.terms) + groups + 1 if internal else 0,
         "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,
@@ -209,7 +203,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
         "right": 2 * SYSTEMS * size,
     }  # fmt: skip
     arrays = (
-        numbers.ravel().tolist(), list(shape.ends), [k for pair in directions for k in pair],
+        numbers.view(np.int64).tolist(), list(shape.ends), [k for pair in directions for k in pair],
         _owned(count, directions), kinds, [0] * (SYSTEMS * size), places, groups_of,
     )  # fmt: skip
     at = np.cumsum([0, *(lengths[name] for name in FLOATS)])
@@ -219,7 +213,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     words = [
         *at[:-1], *whole[:-1], *([0] * len(GIVEN)),
         *_functions(shape, integrated, several, internal),
-        RESULTS, row, width, count, groups, nodes, p, base, carries, shape.terms, shape.top,
+        row, width, count, groups, nodes, p, base, carries, shape.terms, shape.top,
         int(shape.solved), wide, shape.degree, reach, 0, 0, 0, 0,
     ]  # fmt: skip
     return Layout(np.array([*words, *(k for one in arrays for k in one)], np.int64), int(at[-1]))

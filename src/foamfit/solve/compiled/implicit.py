@@ -17,42 +17,18 @@ import math
 import numpy as np
 from numba import cfunc
 
-from foamfit.solve.events import DOUBTFUL, FAILED, SAMPLED, STEPPING, keep_midway, suspicious
-from foamfit.solve.motion import rates
-from foamfit.solve.run import (
-    BEFORE,
-    BEGINNING,
-    BRIEF,
-    DAMPED,
-    DAMPING,
-    DRAGGED,
-    FLOOR,
-    GROW,
-    HORIZON,
-    IN_ROW,
-    LARGEST,
-    NOW,
-    OF_V,
-    OF_W,
-    OVERDAMPED,
-    POINTS,
-    STEP,
-    STEPPED,
-    SYSTEMS,
-    TAKEN,
-    unpack,
+from foamfit.solve.compiled.events import (
+    DOUBTFUL,
+    FAILED,
+    SAMPLED,
+    STEPPING,
+    keep_midway,
+    suspicious,
 )
-from foamfit.solve.scene import FREE, STRESS, VISCOUS
-from foamfit.springs.compiled.contract import (
-    ETA,
-    GAIN,
-    HEIGHT,
-    LOSSY,
-    OPTIONS,
-    TANGENT,
-    inner,
-    past,
-)
+from foamfit.solve.compiled.motion import rates
+from foamfit.solve.compiled.rates import is_unresolved, remember, stiffness_of
+from foamfit.solve.compiled.run import OF_V, OF_W, POINTS, STEPPED, SYSTEMS, spring, unpack
+from foamfit.springs.compiled.contract import OPTIONS, inner, past
 
 
 def _radau() -> tuple[np.ndarray, np.ndarray]:
@@ -161,7 +137,7 @@ def linearise(c, at):  # type: ignore[no-untyped-def]
     for k in range(n * wide):
         jacobian[k] = 0.0
     rates(c, y, f0, c.none, at)
-    c.drive[BEGINNING] = abs(c.carried[0])
+    c.drive.beginning = abs(c.carried[0])
     for one in range(n):
         step = 1e-8 * max(abs(y[one]), _scale(c, one))
         if step == 0.0:
@@ -292,7 +268,7 @@ def _is_lossy(c, g):  # type: ignore[no-untyped-def]
     """Whether a stress in a group depends on the strain rate, besides that of dashpots."""
     lossy = False
     for i in range(c.ends[g - 1] if g > 0 else 0, c.ends[g] if g < c.groups else 0):
-        lossy = lossy or past(c.springs, i * c.width)[LOSSY] > 0.0
+        lossy = lossy or spring(c, i).lossy > 0.0
     return lossy
 
 
@@ -311,9 +287,9 @@ def _size(c, k, old, new):  # type: ignore[no-untyped-def]
     if _is_lossy(c, g) or _is_lossy(c, g + 1):
         return max(_scale(c, k), size)
     damping = stiffness_of(c, g, True) + stiffness_of(c, g + 1, True)
-    if c.drive[OVERDAMPED] > 0.0:
-        return max(c.drive[BEGINNING], abs(c.carried[0])) / damping
-    return max(c.now[LARGEST] / damping, size) if damping > 0.0 else math.inf
+    if c.drive.overdamped > 0.0:
+        return max(c.drive.beginning, abs(c.carried[0])) / damping
+    return max(c.now.largest / damping, size) if damping > 0.0 else math.inf
 
 
 @inner
@@ -371,70 +347,6 @@ def _guess(c, h, last):  # type: ignore[no-untyped-def]
             move[k] = value - whole
 
 
-# ---------------------------------------------------------------- vibrations
-
-
-@inner
-def stiffness_of(c, g, damped):  # type: ignore[no-untyped-def]
-    """Return the stiffness of a group or, if `damped`, its damping; 0 beyond both ends."""
-    if g >= c.groups or (g == c.groups - 1 and c.nodes < c.groups and c.top == STRESS):
-        return 0.0
-    soft = 0.0
-    for i in range(c.ends[g - 1] if g > 0 else 0, c.ends[g]):
-        s = past(c.springs, i * c.width)
-        part = s[ETA] if damped else s[GAIN] * s[TANGENT]
-        soft += s[HEIGHT] / part if part > 0.0 else math.inf
-    return 1.0 / soft
-
-
-@inner
-def is_unresolved(c, span):  # type: ignore[no-untyped-def]
-    """Whether a mass vibrates too fast for a step and keeps vibrating after it."""
-    for g in range(c.nodes):
-        own = math.sqrt((stiffness_of(c, g, False) + stiffness_of(c, g + 1, False)) * c.per_mass[g])
-        fade = 0.5 * c.per_mass[g] * (stiffness_of(c, g, True) + stiffness_of(c, g + 1, True))
-        if own * span > 0.5 and fade < own and fade * span < 20.0 and c.top != VISCOUS:
-            return True
-    return False
-
-
-@inner
-def remember(c, span, wait):  # type: ignore[no-untyped-def]
-    """Add the vibrations that a step was too long to resolve to those the response lacks.
-
-    A mass whose velocity differs by δv from the initial velocity of the step's polynomial then
-    vibrates with amplitude δv/ω. `alive` (groups, 2) sums δv/√ω over all steps, because a vibration
-    whose stiffness changes slowly conserves energy over frequency, and keeps the decay rate of the
-    slowest: in a row of masses the slowest unresolved vibration decays last, with the amplitude of
-    all of them together. `worst` (motion, stress) includes the vibration left after `wait`, at the
-    first sample that may show it.
-    """
-    motion = stress = 0.0
-    alive, worst = c.alive, c.worst
-    row = math.sin(0.5 * math.pi / max(c.nodes, 2))
-    for g in range(c.nodes):
-        below, above = stiffness_of(c, g, False), stiffness_of(c, g + 1, False)
-        damping = stiffness_of(c, g, True) + stiffness_of(c, g + 1, True)
-        damping += c.drive[DRAGGED] if g == c.groups - 1 else 0.0
-        own = math.sqrt((below + above) * c.per_mass[g])
-        fade, root = 0.5 * damping * c.per_mass[g], math.sqrt(own)
-        if (g == c.groups - 1 and c.top != FREE) or own == 0.0:
-            continue
-        started = 0.0
-        if own * span > 2.0 and fade < own:
-            started = abs(c.line[2 * g] - span * c.y[2 * g + 1]) / span / root
-            slow = fade * min(max(2.0 * row * row, 4.0 / (own * span) ** 2), 1.0)
-            lasting = alive[2 * g] > 1e-3 * started
-            alive[2 * g + 1] = min(slow, alive[2 * g + 1]) if lasting else slow
-            alive[2 * g] += started
-        if alive[2 * g] > 0.0:
-            size = alive[2 * g] / root * math.exp(-alive[2 * g + 1] * wait)
-            motion += size
-            stress = max(stress, max(below, above) * size)
-            alive[2 * g] *= math.exp(-alive[2 * g + 1] * span)
-    worst[0], worst[1] = max(worst[0], motion), max(worst[1], stress)
-
-
 # ---------------------------------------------------------------- length of steps
 
 
@@ -447,26 +359,26 @@ def _allowed(c, h, excess, tol, rounded):  # type: ignore[no-untyped-def]
     r = c.now
     if not excess < math.inf:
         return 0.3 * h
-    factor, floor = 0.9 * max(excess, 1e-12) ** (-1.0 / 6.0), max(r[FLOOR], 1e-15 * abs(r[NOW]))
+    factor, floor = 0.9 * max(excess, 1e-12) ** (-1.0 / 6.0), max(r.floor, 1e-15 * abs(r.now))
     if excess > 1.0 and not rounded and h > floor * (1.0 + 1e-9):
         return max(h * min(max(factor, 0.1), 0.9), floor)
     if excess <= 1.0:
-        r[DAMPING] = 0.0
-    elif excess * tol > r[DAMPING] and is_unresolved(c, h):
-        r[DAMPED] += excess * tol - r[DAMPING]
-        r[DAMPING] = excess * tol
-    proposed = max(h * min(max(factor, 0.2), 5.0), r[FLOOR])
+        r.damping = 0.0
+    elif excess * tol > r.damping and is_unresolved(c, h):
+        r.damped += excess * tol - r.damping
+        r.damping = excess * tol
+    proposed = max(h * min(max(factor, 0.2), 5.0), r.floor)
     if excess > 1.0:
         proposed = max(proposed, 2.0 * h)
-    whole = r[NOW] + h >= r[HORIZON]
-    if proposed >= r[BRIEF]:
-        r[IN_ROW] = r[FLOOR] = 0.0
+    whole = r.now + h >= r.horizon
+    if proposed >= r.brief:
+        r.in_row = r.floor = 0.0
     elif not whole:
-        r[IN_ROW] += 1.0
-        if r[IN_ROW] > FOLLOW_LIMIT:
-            r[FLOOR] = min(max(2.0 * r[FLOOR], 2.0 * h), r[BRIEF])
-            proposed = max(proposed, r[FLOOR])
-    r[GROW] = proposed / h
+        r.in_row += 1.0
+        if r.in_row > FOLLOW_LIMIT:
+            r.floor = min(max(2.0 * r.floor, 2.0 * h), r.brief)
+            proposed = max(proposed, r.floor)
+    r.grow = proposed / h
     return h
 
 
@@ -474,18 +386,18 @@ def _allowed(c, h, excess, tol, rounded):  # type: ignore[no-untyped-def]
 def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
     """Take one implicit step, shorter ones until it is accurate; return how it ended."""
     c = unpack(words)
-    r, at = c.now, c.now[NOW]
+    r, at = c.now, c.now.now
     linearise(c, at)
-    first, first_error = r[STEP], math.inf
+    first, first_error = r.step, math.inf
     while True:
-        h = r[STEP]
-        if r[NOW] + h == r[NOW] or not h > 0.0 or r[TAKEN] >= most:
+        h = r.step
+        if r.now + h == r.now or not h > 0.0 or r.taken >= most:
             return FAILED
-        r[TAKEN] += 1.0
-        _guess(c, h, r[BEFORE])
+        r.taken += 1.0
+        _guess(c, h, r.before)
         solved = prepare(c, h)
         if not (solved and _collocate(c, h, at, tol, want)):
-            r[STEP], r[BEFORE] = 0.3 * h, 0.0
+            r.step, r.before = 0.3 * h, 0.0
             continue
         excess = _error(c, h, tol)
         if first_error == math.inf:
@@ -493,12 +405,12 @@ def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
         rounded = h <= 1e-6 * first and excess > 0.3 * first_error
         allowed = _allowed(c, h, excess, tol, rounded)
         if allowed < h:
-            r[STEP] = allowed
+            r.step = allowed
             continue
         break
     _finish(c, h, at, want)
-    remember(c, h, max(upto - r[NOW], 0.0) if upto < math.inf else h)
-    r[BEFORE] = h
+    remember(c, h, max(upto - r.now, 0.0) if upto < math.inf else h)
+    r.before = h
     return DOUBTFUL if suspicious(c, h) else SAMPLED
 
 

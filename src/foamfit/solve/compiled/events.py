@@ -6,60 +6,34 @@ Events are found on the dense output of a step.
 from __future__ import annotations
 
 from numba import cfunc, types
-from numba.extending import intrinsic
 
-from foamfit.solve.motion import JUMP, call_inside, rates
-from foamfit.solve.run import (
-    DRAGGED,
-    KIND,
-    LARGEST,
-    NOW,
-    NUMBERS,
-    OVERDAMPED,
-    PARAMETERS,
-    PRESSED,
-    RECORD,
-    STEP,
-    VALUE,
-    X_AT,
-    unpack,
-)
+from foamfit.solve.compiled.motion import JUMP, call_inside, rates
+from foamfit.solve.compiled.run import RECORD, numbers, spring, unpack
 from foamfit.springs.compiled.contract import (
     BY,
-    EPS,
     EXPLICIT,
-    HIGH,
     INTERNAL,
-    LOW,
-    MIDWAY,
     OF_HELD,
     OF_PARAMETER,
     OF_STRESS,
-    OLD_EPS,
-    OLD_RATE,
     OPTIONS,
-    RATE,
     REAL,
     REALS_AT,
-    SLOPE,
-    SWITCH,
-    TOTAL,
-    TURNS,
+    RESULTS,
     WHOLE,
     WHOLES_AT,
-    X,
-    by_address,
     call_switch,
+    calling,
     inlined,
     inner,
     past,
-)  # fmt: skip
-from foamfit.springs.parameters import OWN_ETA
+)
+from foamfit.springs.laws.record import OWN_ETA
 
 ROUNDED = 1e-12  # strain past an end that rounding explains, of a spring that moves away from it
 AT_ONCE = 1e-9  # share of a step within which an event is at its start
 RISEN = 1e-9  # base stress over the largest stress above which its return to zero ends the contact
-MIDDLE = 0.6  # share of a step at which s[MIDWAY] is the strain rate; 0.58 of an implicit step
+MIDDLE = 0.6  # share of a step at which s.midway is the strain rate; 0.58 of an implicit step
 DIP = 0.3  # least strain rate within a step, over its variation, below which the rate may vanish
 NOWHERE = 2.0  # instead of a share of a step
 # Kinds of events: a branch ends at its upper or lower strain, a spring turns, contact ends. Then a
@@ -70,9 +44,7 @@ PLAIN, SAMPLED, DOUBTFUL, FAILED = range(4)  # ends of an attempted step
 STEPPING = WHOLE(WHOLES_AT, WHOLE, REAL, REAL, REAL)
 
 
-@intrinsic
-def _call_step(typing, where, c, want, tol, upto, most):  # type: ignore[no-untyped-def]
-    return WHOLE(WHOLE, RECORD, WHOLE, REAL, REAL, REAL), by_address
+_call_step = calling(WHOLE, RECORD, WHOLE, REAL, REAL, REAL)
 
 
 @inlined
@@ -84,19 +56,19 @@ def take_step(c, want, tol, upto, most):  # type: ignore[no-untyped-def]
 @cfunc(types.void(WHOLES_AT, WHOLE, WHOLE, REALS_AT), **OPTIONS, cache=True)
 def _change_branch(words, i, up, y):  # type: ignore[no-untyped-def]
     c = unpack(words)
-    s, n, p = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS), c.p
-    out, kind, directions = past(s, c.results), n[KIND], c.directions
-    slope = out[SLOPE]
-    changes = past(out, BY + n[PARAMETERS])  # no derivatives of a BY_STRESS law
+    s, n, p = spring(c, i), numbers(c, i), c.p
+    out, kind, directions = past(s, RESULTS), n.kind, c.directions
+    slope = s.slope
+    changes = past(out, BY + n.parameters)  # no derivatives of a BY_STRESS law
     if kind == INTERNAL:
         call_inside(c, JUMP, i, up, y, y, y, y)
         return
-    call_switch(n[SWITCH], past(s, c.row), s, up, changes)
+    call_switch(n.switch, past(s, c.row), s, up, changes)
     if kind == EXPLICIT:
         return
-    if not c.solved and n[X_AT] >= 0:
-        y[n[X_AT]] = s[X]
-    held, change = past(c.held, 2 * i * p), OF_PARAMETER + n[PARAMETERS]
+    if not c.solved and n.x_at >= 0:
+        y[n.x_at] = s.x
+    held, change = past(c.held, 2 * i * p), OF_PARAMETER + n.parameters
     for j in range(p):
         d_sigma = slope * c.strain[i * p + j] + c.part[i * p + j]
         first, second, own = held[j], held[p + j], directions[2 * j + 1]
@@ -111,9 +83,7 @@ def _change_branch(words, i, up, y):  # type: ignore[no-untyped-def]
 CHANGE = _change_branch.address
 
 
-@intrinsic
-def _call_change(typing, where, c, i, up, y):  # type: ignore[no-untyped-def]
-    return types.void(WHOLE, RECORD, WHOLE, WHOLE, REALS_AT), by_address
+_call_change = calling(types.void, RECORD, WHOLE, WHOLE, REALS_AT)
 
 
 @inlined
@@ -152,33 +122,33 @@ def _stress_of_momentum(c, x):  # type: ignore[no-untyped-def]
     line, wide, rate = c.line, c.wide, 0.0
     for q in range(c.degree - 1, -1, -1):
         rate = rate * x + (q + 1) * line[q * wide + 1]
-    return c.drive[VALUE] - c.drive[DRAGGED] * c.state[1] - rate / c.now[STEP] / c.per_mass[0]
+    return c.drive.value - c.drive.dragged * c.state[1] - rate / c.now.step / c.per_mass[0]
 
 
 @inner
 def look(c, x):  # type: ignore[no-untyped-def]
     """Fill the values of all springs at the share x of the step."""
     dense(c, c.base, x, c.state)
-    rates(c, c.state, c.f, c.none, c.now[NOW] + x * c.now[STEP])
-    if c.drive[OVERDAMPED] > 0.0 and c.groups == 1:
+    rates(c, c.state, c.f, c.none, c.now.now + x * c.now.step)
+    if c.drive.overdamped > 0.0 and c.groups == 1:
         c.carried[0] = _stress_of_momentum(c, x)
 
 
 @inner
 def _excess(c, i, kind):  # type: ignore[no-untyped-def]
     """Return how far a spring is past the end of its branch, or the contact past its own."""
-    s = past(c.springs, i * c.width)
+    s = spring(c, i)
     if kind == RELEASE:
         return -c.carried[0]
     if kind >= TURN:
-        return -s[RATE] * (s[TURNS] if kind == TURN else 1.0 if kind == TOP_TURN else -1.0)
-    return s[EPS] - s[HIGH] if kind == TOP_END else s[LOW] - s[EPS]
+        return -s.rate * (s.turns if kind == TURN else 1.0 if kind == TOP_TURN else -1.0)
+    return s.eps - s.high if kind == TOP_END else s.low - s.eps
 
 
 @inner
 def _happened(c, i, kind):  # type: ignore[no-untyped-def]
     """Whether a spring is past an end or has turned, and not by rounding while it moves away."""
-    over, rate = _excess(c, i, kind), c.springs[i * c.width + RATE]
+    over, rate = _excess(c, i, kind), spring(c, i).rate
     leaves = kind < TURN and over < ROUNDED and (rate < 0.0) == (kind == TOP_END)
     return over > 0.0 and not leaves
 
@@ -192,10 +162,10 @@ def _root(c, low, high, i, kind):  # type: ignore[no-untyped-def]
     f_high, side = _excess(c, i, kind), 0
     if f_low >= 0.0:
         return low
-    s, value, dt, middle = past(c.springs, i * c.width), f_high, c.now[STEP], high
+    s, value, dt, middle = spring(c, i), f_high, c.now.step, high
     for _ in range(60):
         if kind < TURN:  # Newton's method
-            middle -= value / ((s[RATE] if kind == TOP_END else -s[RATE]) * dt)
+            middle -= value / ((s.rate if kind == TOP_END else -s.rate) * dt)
         if kind >= TURN or not low < middle < high:
             middle = high - f_high * (high - low) / (f_high - f_low)
         if high - low <= 4e-16 or not low < middle < high:
@@ -240,7 +210,7 @@ def _earliest(c, before, share):  # type: ignore[no-untyped-def]
     """Return the first of the events in (before, share] whose effect is seen at the end."""
     found, who, what = share, -1 + c.none, -1 + c.none
     look(c, found)
-    if c.now[PRESSED] > 0.0 and c.carried[0] <= 0.0:
+    if c.now.pressed > 0.0 and c.carried[0] <= 0.0:
         found, who, what = (
             _locate(c, before, found, c.none, RELEASE + c.none),
             c.none,
@@ -254,7 +224,7 @@ def _earliest(c, before, share):  # type: ignore[no-untyped-def]
                 if who < 0 or there < found:
                     found, who, what = there, i, kind
                 look(c, found)
-    if who >= 0 and what != RELEASE and c.now[PRESSED] > 0.0:  # the contact ends as well
+    if who >= 0 and what != RELEASE and c.now.pressed > 0.0:  # the contact ends as well
         look(c, min(found + 1e-9, 1.0))
         what = RELEASE + c.none if c.carried[0] <= 0.0 else what
     return found, who, what
@@ -270,8 +240,8 @@ def first_event(c):  # type: ignore[no-untyped-def]
     nobody, before, pieces, dip, piece = -1 + c.none, 0.0, 1, NOWHERE, 1
     look(c, 1.0)
     for i in range(c.count):
-        s = past(c.springs, i * c.width)
-        if s[OLD_RATE] * s[RATE] <= 0.0:
+        s = spring(c, i)
+        if s.old_rate * s.rate <= 0.0:
             pieces = 4
         there = _may_dip(s)
         if there < 1.0:
@@ -287,19 +257,19 @@ def first_event(c):  # type: ignore[no-untyped-def]
         if who >= 0:
             return found, who, what
         for i in range(c.count):
-            s = past(c.springs, i * c.width)
+            s = spring(c, i)
             if not known:
                 look(c, share)
-            known = not _may_pass(s, (share - before) * c.now[STEP])
+            known = not _may_pass(s, (share - before) * c.now.step)
             if not known:
-                turn = _locate(c, before, share, i, TOP_TURN if s[RATE] < 0.0 else LOW_TURN)
+                turn = _locate(c, before, share, i, TOP_TURN if s.rate < 0.0 else LOW_TURN)
                 found, who, what = _earliest(c, before, turn)
                 if who >= 0:
                     return found, who, what
         look(c, share)
         for i in range(c.count):
-            s = past(c.springs, i * c.width)
-            s[OLD_EPS], s[OLD_RATE] = s[EPS], s[RATE]
+            s = spring(c, i)
+            s.old_eps, s.old_rate = s.eps, s.rate
         before = share
     return 1.0, nobody, nobody
 
@@ -307,10 +277,10 @@ def first_event(c):  # type: ignore[no-untyped-def]
 @inner
 def _may_pass(s, dt):  # type: ignore[no-untyped-def]
     """Whether an extremum since the old strain may lie past an end of the branch."""
-    if not s[OLD_RATE] * s[RATE] < 0.0:
+    if not s.old_rate * s.rate < 0.0:
         return False
-    most = 0.5 * dt * max(abs(s[OLD_RATE]), abs(s[RATE]))  # it is at most this far away
-    return max(s[EPS], s[OLD_EPS]) + most > s[HIGH] or min(s[EPS], s[OLD_EPS]) - most < s[LOW]
+    most = 0.5 * dt * max(abs(s.old_rate), abs(s.rate))  # it is at most this far away
+    return max(s.eps, s.old_eps) + most > s.high or min(s.eps, s.old_eps) - most < s.low
 
 
 @inner
@@ -330,22 +300,22 @@ def _may_dip(s):  # type: ignore[no-untyped-def]
 
     Its rate has the sign of the branch at both ends of the step.
     """
-    start, end = s[TURNS] * s[OLD_RATE], s[TURNS] * s[RATE]
+    start, end = s.turns * s.old_rate, s.turns * s.rate
     if not (start > 0.0 and end > 0.0):
         return NOWHERE
-    x, least = _vertex(0.0, start, MIDDLE, s[TURNS] * s[MIDWAY], 1.0, end)
+    x, least = _vertex(0.0, start, MIDDLE, s.turns * s.midway, 1.0, end)
     return x if 0.0 < x < 1.0 and least < DIP * (max(start, end) - least) else NOWHERE
 
 
 @inner
 def _turned(c, i, x):  # type: ignore[no-untyped-def]
     """Return a share of the step at which a spring moves against its branch, from a guess x."""
-    s, low, high = past(c.springs, i * c.width), 0.0, 1.0
-    way = s[TURNS]
-    f_low, f_high, middle, least = way * s[OLD_RATE], way * s[RATE], NOWHERE, 0.0
+    s, low, high = spring(c, i), 0.0, 1.0
+    way = s.turns
+    f_low, f_high, middle, least = way * s.old_rate, way * s.rate, NOWHERE, 0.0
     for _ in range(8):
         look(c, x)
-        value = way * s[RATE]
+        value = way * s.rate
         if value < 0.0:
             return x
         if middle == NOWHERE:
@@ -369,20 +339,20 @@ def _turned(c, i, x):  # type: ignore[no-untyped-def]
 def keep_midway(c):  # type: ignore[no-untyped-def]
     """Keep the strain rates about the middle of a step."""
     for i in range(c.count):
-        s = past(c.springs, i * c.width)
-        s[MIDWAY] = s[RATE]
+        s = spring(c, i)
+        s.midway = s.rate
 
 
 @inner
 def suspicious(c, dt):  # type: ignore[no-untyped-def]
     """Whether a step may contain an event, by the values at both ends."""
-    if c.now[PRESSED] > 0.0 and c.carried[0] <= 0.0:
+    if c.now.pressed > 0.0 and c.carried[0] <= 0.0:
         return True
     for i in range(c.count):
-        s = past(c.springs, i * c.width)
-        if s[EPS] > s[HIGH] or s[EPS] < s[LOW] or s[TURNS] * s[RATE] < 0.0:
+        s = spring(c, i)
+        if s.eps > s.high or s.eps < s.low or s.turns * s.rate < 0.0:
             return True
-        if _may_pass(s, dt) or (s[TURNS] != 0.0 and _may_dip(s) < 1.0):
+        if _may_pass(s, dt) or (s.turns != 0.0 and _may_dip(s) < 1.0):
             return True
     return False
 
@@ -390,11 +360,11 @@ def suspicious(c, dt):  # type: ignore[no-untyped-def]
 @inner
 def keep_values(c):  # type: ignore[no-untyped-def]
     """Keep strains and rates of the beginning of a step, and the largest stress."""
-    largest = c.now[LARGEST]
+    largest = c.now.largest
     for i in range(c.count):
-        s = past(c.springs, i * c.width)
-        s[OLD_EPS], s[OLD_RATE] = s[EPS], s[RATE]
-        largest = max(largest, abs(s[TOTAL]))
+        s = spring(c, i)
+        s.old_eps, s.old_rate = s.eps, s.rate
+        largest = max(largest, abs(s.total))
     for g in range(c.groups):  # with dashpots
         largest = max(largest, abs(c.carried[g]))
-    c.now[LARGEST] = largest
+    c.now.largest = largest

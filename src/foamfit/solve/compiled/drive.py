@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from numba import cfunc
 
-from foamfit.solve.motion import (
+from foamfit.solve.compiled.motion import (
     BEGIN_RAMP,
     END_RAMP,
     ONLY_DERIVATIVES,
@@ -13,54 +13,31 @@ from foamfit.solve.motion import (
     rates,
     rates_of,
 )
-from foamfit.solve.run import (
-    BEGUN,
-    EPS_AT,
-    HORIZON,
-    KIND,
-    NOW,
-    NUMBERS,
-    PIECE,
-    VALUE,
-    VALUE_RATE,
-    X_AT,
-    Z_AT,
-    unpack,
-)
-from foamfit.solve.samples import row_of, write
+from foamfit.solve.compiled.run import numbers, spring, unpack
+from foamfit.solve.compiled.samples import row_of, write
+from foamfit.solve.compiled.static import bring, push_to, strain_to
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
-from foamfit.solve.static import bring, push_to, strain_to
 from foamfit.springs.compiled.contract import (
     BY_STRESS,
-    EPS,
-    ETA,
-    GAIN,
-    HEIGHT,
     INTERNAL,
-    OF_LAW,
-    OFFSET,
     OPTIONS,
     RELAX,
-    SLOPE,
-    TANGENT,
-    TOTAL,
     WHOLE,
     WHOLES_AT,
-    X,
     inner,
     past,
-)  # fmt: skip
+)
 
 
 @inner
 def _begin_piece(c, k):  # type: ignore[no-untyped-def]
     """Prescribe the drive between samples k and k + 1."""
     r, drive, t, values = c.now, c.drive, c.time, c.values
-    r[NOW], r[BEGUN], drive[VALUE], drive[VALUE_RATE] = 0.0, t[k], values[k], 0.0
-    r[HORIZON] = 0.0
+    r.now, r.begun, drive.value, drive.value_rate = 0.0, t[k], values[k], 0.0
+    r.horizon = 0.0
     if k + 1 < c.samples:
-        r[HORIZON] = t[k + 1] - t[k]
-        drive[VALUE_RATE] = (values[k + 1] - values[k]) / (t[k + 1] - t[k])
+        r.horizon = t[k + 1] - t[k]
+        drive.value_rate = (values[k + 1] - values[k]) / (t[k + 1] - t[k])
 
 
 @inner
@@ -69,7 +46,7 @@ def _starts_on_ramp(c):  # type: ignore[no-untyped-def]
     if c.values[0] == 0.0 or not (c.top == MOTION or c.top == STRESS):
         return False
     for i in range(c.ends[c.groups - 2] if c.groups > 1 else c.none, c.count):
-        if c.numbers[i * NUMBERS + KIND] == INTERNAL:
+        if numbers(c, i).kind == INTERNAL:
             return True
     return False
 
@@ -83,35 +60,35 @@ def _start(c):  # type: ignore[no-untyped-def]
     g, y = c.groups - 1, c.y
     i0, i1 = (c.ends[g - 1] if g > 0 else c.none), c.ends[g]
     _begin_piece(c, c.none)
-    first = c.drive[VALUE]
+    first = c.drive.value
     if c.top == FREE or c.top == VISCOUS:
         return
     for i in range(i0, i1):
-        c.springs[i * c.width + GAIN] = 1.0  # relaxation terms carry nothing yet
+        spring(c, i).gain = 1.0  # relaxation terms carry nothing yet
     if c.top == STRESS:
         for i in range(i0, i1):
-            if c.springs[i * c.width + ETA] == 0.0:
+            if spring(c, i).eta == 0.0:
                 push_to(c, i, first, 0.0, y)
     elif i1 - i0 == 1:
-        strain_to(c, i0, first / c.springs[i0 * c.width + HEIGHT], y)
+        strain_to(c, i0, first / spring(c, i0).height, y)
     else:
         first = bring(c, i0, i1, first, 0.0, y)
     for i in range(i0, i1):
-        s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
+        s, n = spring(c, i), numbers(c, i)
         evaluate(c, i, int(c.p > 0))
-        s[TANGENT], s[TOTAL] = s[c.results + SLOPE], s[c.results + OF_LAW]
-        if n[EPS_AT] >= 0:
-            y[n[EPS_AT]] = s[EPS]
-        if n[KIND] == BY_STRESS and n[X_AT] >= 0:
-            y[n[X_AT]] = s[X]
+        s.tangent, s.total = s.slope, s.sigma
+        if n.eps_at >= 0:
+            y[n.eps_at] = s.eps
+        if n.kind == BY_STRESS and n.x_at >= 0:
+            y[n.x_at] = s.x
         for k in range(c.terms):
-            y[n[Z_AT] + k] = -s[TOTAL]
+            y[n.z_at + k] = -s.total
     if c.p > 0:
         _derive_start(c, g, i0, i1, first)
     for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
+        s = spring(c, i)
         for k in range(c.terms):
-            s[GAIN] += s[RELAX + 2 * k]
+            s.gain += s[RELAX + 2 * k]
 
 
 @inner
@@ -123,23 +100,23 @@ def _derive_start(c, g, i0, i1, common):  # type: ignore[no-untyped-def]
     y, p, base = c.y, c.p, c.base
     c.carried[g] = common
     for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
-        s[OFFSET] = s[ETA]
-        s[ETA] = 0.0 if c.top == MOTION else s[ETA]
+        s = spring(c, i)
+        s.offset = s.eta
+        s.eta = 0.0 if c.top == MOTION else s.eta
     rates_of(c, g, y, c.f, ONLY_DERIVATIVES, 0.0)
     for i in range(i0, i1):
         s, n, strain = (
-            past(c.springs, i * c.width),
-            past(c.numbers, i * NUMBERS),
+            spring(c, i),
+            numbers(c, i),
             past(c.strain, i * p),
         )
-        s[ETA], s[OFFSET] = s[OFFSET], 0.0
-        slope, part, at = s[c.results + SLOPE], past(c.part, i * p), base + n[EPS_AT] * p
-        if s[ETA] > 0.0 and n[EPS_AT] >= 0:
+        s.eta, s.offset = s.offset, 0.0
+        slope, part, at = s.slope, past(c.part, i * p), base + n.eps_at * p
+        if s.eta > 0.0 and n.eps_at >= 0:
             for j in range(p):
                 strain[j] = y[at + j] = strain[j] if c.top == MOTION else 0.0
         for k in range(c.terms):
-            z = past(y, base + (n[Z_AT] + k) * p)
+            z = past(y, base + (n.z_at + k) * p)
             for j in range(p):
                 z[j] = -(slope * strain[j] + part[j])
 
@@ -150,12 +127,12 @@ def _next_piece(c, want):  # type: ignore[no-untyped-def]
 
     Dashpots have the mean rate at a sample where the prescribed rate jumps.
     """
-    r, k, t = c.now, int(c.now[PIECE]) + 1, c.time
+    r, k, t = c.now, int(c.now.piece) + 1, c.time
     if k == 0:  # after a ramp
         call_inside(c, END_RAMP, c.none, want, c.y, c.stage, c.y, c.y)
         _begin_piece(c, k)
-    write(c, c.y, r[NOW], k, want)
-    r[PIECE] = k
+    write(c, c.y, r.now, k, want)
+    r.piece = k
     if k == c.samples - 1:
         return 1
     if k > 0:

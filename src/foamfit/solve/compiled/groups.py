@@ -14,9 +14,8 @@ import math
 
 from numba import cfunc
 
-from foamfit.solve.equilibrium import put, root, strain_at
-from foamfit.solve.events import ROUNDED
-from foamfit.solve.motion import (
+from foamfit.solve.compiled.events import ROUNDED
+from foamfit.solve.compiled.motion import (
     GROUP,
     LOSE,
     LOSSES,
@@ -30,50 +29,10 @@ from foamfit.solve.motion import (
     span_of,
     span_tangents,
 )
-from foamfit.solve.run import (
-    DRAGGED,
-    EPS_AT,
-    FLAT,
-    INTERNALS,
-    KIND,
-    NUMBERS,
-    PACE,
-    PUSH,
-    SPREAD,
-    TOP_SPEED,
-    VALUE,
-    VALUE_RATE,
-    X_AT,
-    Z_AT,
-    unpack,
-)
+from foamfit.solve.compiled.run import numbers, spring, unpack
+from foamfit.solve.compiled.static import put, root, strain_at
 from foamfit.solve.scene import STRESS, VISCOUS
-from foamfit.springs.compiled.contract import (
-    BY_STRESS,
-    DRIFT,
-    EPS,
-    ETA,
-    GAIN,
-    HEIGHT,
-    HIGH,
-    INTERNAL,
-    LOSS,
-    LOSSY,
-    LOW,
-    OFFSET,
-    OPTIONS,
-    RATE,
-    RELAX,
-    SIGMA_HIGH,
-    SIGMA_LOW,
-    STEEP,
-    TANGENT,
-    TOTAL,
-    TURNS,
-    X,
-    inner,
-    past,
-)  # fmt: skip
+from foamfit.springs.compiled.contract import BY_STRESS, INTERNAL, OPTIONS, RELAX, X, inner, past
 
 STANDS, MOVES = 1e-12, 1e-9  # relative rates that are nothing but rounding, and more than that
 SNAPPING = (0, 2, 3)  # parameters of a bistable law on which the stress at A1 depends
@@ -85,48 +44,48 @@ def _follow(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
     i0, i1 = (c.ends[g - 1] if g > 0 else 0), c.ends[g]
     reach, rate = span_of(c, g, y, at)
     last = g == c.groups - 1
-    push = c.drive[VALUE] + c.drive[VALUE_RATE] * at
+    push = c.drive.value + c.drive.value_rate * at
     weight, total, pull, loose, flat, lossy = 0.0, rate, -rate, -1, -1, False
     if c.solved:
         solve_loose(c, g, i0, i1, reach, push, y)
     for i in range(i0, i1):
-        s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-        eps = y[n[EPS_AT]] if s[ETA] > 0.0 or not c.solved else s[EPS]
-        h, eta, stress = s[HEIGHT], s[ETA], follow_spring(c, i, eps, y, f, want)
+        s, n = spring(c, i), numbers(c, i)
+        eps = y[n.eps_at] if s.eta > 0.0 or not c.solved else s.eps
+        h, eta, stress = s.height, s.eta, follow_spring(c, i, eps, y, f, want)
         if eta > 0.0:
             weight += h / eta
             total += h / eta * stress
             pull += h / eta * (push - stress)
-            lossy = lossy or s[LOSSY] * c.drive[PACE] > 0.0
+            lossy = lossy or s.lossy * c.drive.pace > 0.0
         else:
             loose = i
-            if s[TANGENT] == 0.0:
+            if s.tangent == 0.0:
                 flat = i
     if last and c.top == STRESS:
         common = push
     elif loose >= 0:
-        common = past(c.springs, (loose if flat < 0 else flat) * c.width)[TOTAL]
+        common = spring(c, loose if flat < 0 else flat).total
     elif lossy:
-        c.drive[PUSH], c.drive[SPREAD] = push, rate
+        c.drive.push, c.drive.spread = push, rate
         call_inside(c, SHARE, g, want, y, f, y, y)
         common = c.carried[g]
     elif last and c.top == VISCOUS:  # without the difference of S and push, which may be tiny
-        common = push - c.drive[DRAGGED] * pull / (c.drive[DRAGGED] * weight + 1.0)
+        common = push - c.drive.dragged * pull / (c.drive.dragged * weight + 1.0)
     else:
         common = total / weight
     if last and c.top == VISCOUS:
-        drag = c.drive[DRAGGED]
+        drag = c.drive.dragged
         if loose >= 0:
-            c.drive[TOP_SPEED] = (push - common) / drag
+            c.drive.top_speed = (push - common) / drag
         elif not lossy:
-            c.drive[TOP_SPEED] = pull / (drag * weight + 1.0)
-        rate += c.drive[TOP_SPEED]
+            c.drive.top_speed = pull / (drag * weight + 1.0)
+        rate += c.drive.top_speed
     c.carried[g] = common
     share_rate(c, g, i0, i1, rate, loose, flat, last and c.top == STRESS, lossy)
     for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
-        if s[ETA] > 0.0 or not c.solved:
-            f[c.numbers[i * NUMBERS + EPS_AT]] = s[RATE]
+        s = spring(c, i)
+        if s.eta > 0.0 or not c.solved:
+            f[numbers(c, i).eps_at] = s.rate
         move_inside(c, i, f)
 
 
@@ -136,37 +95,37 @@ def solve_loose(c, g, i0, i1, reach, push, y):  # type: ignore[no-untyped-def]
     flat, rest, some = -1, reach, False
     common = c.carried[g] if abs(c.carried[g]) < math.inf else 0.0  # after a trial that failed
     for i in range(i0, i1):
-        s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-        s[OFFSET] = 0.0
+        s, n = spring(c, i), numbers(c, i)
+        s.offset = 0.0
         for k in range(c.terms):
-            s[OFFSET] += s[RELAX + 2 * k] * y[n[Z_AT] + k]
-        if s[ETA] > 0.0:
-            rest -= s[HEIGHT] * y[n[EPS_AT]]
+            s.offset += s[RELAX + 2 * k] * y[n.z_at + k]
+        if s.eta > 0.0:
+            rest -= s.height * y[n.eps_at]
             continue
         some = True
-        if n[KIND] == INTERNAL:
-            for k in range(n[INTERNALS]):
-                s[X + k] = y[n[X_AT] + k]
-        if s[SIGMA_LOW] == s[SIGMA_HIGH]:
+        if n.kind == INTERNAL:
+            for k in range(n.internals):
+                s[X + k] = y[n.x_at + k]
+        if s.sigma_low == s.sigma_high:
             flat = i
     if not some:
         return
     if g == c.groups - 1 and c.top == STRESS:
         common = push
     elif flat >= 0:
-        s = past(c.springs, flat * c.width)
-        common = s[GAIN] * s[SIGMA_HIGH] + s[OFFSET]
+        s = spring(c, flat)
+        common = s.gain * s.sigma_high + s.offset
     else:
         root(c, i0, i1, rest, common, -math.inf, math.inf, 1)
         return
     for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
-        if s[ETA] == 0.0 and i != flat:
+        s = spring(c, i)
+        if s.eta == 0.0 and i != flat:
             put(c, i, strain_at(c, i, common), common)
-            rest -= s[HEIGHT] * s[EPS]
+            rest -= s.height * s.eps
     if flat >= 0 and not (g == c.groups - 1 and c.top == STRESS):
-        s = past(c.springs, flat * c.width)
-        s[EPS] = rest / s[HEIGHT]
+        s = spring(c, flat)
+        s.eps = rest / s.height
 
 
 @inner
@@ -177,12 +136,12 @@ def _close(c, i0, i1, rest, pushed):  # type: ignore[no-untyped-def]
     """
     least, where = math.inf, i0
     for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
-        if s[LOSS] < least * s[HEIGHT]:
-            least, where = s[LOSS] / s[HEIGHT], i
+        s = spring(c, i)
+        if s.loss < least * s.height:
+            least, where = s.loss / s.height, i
     if not pushed:
-        s = past(c.springs, where * c.width)
-        s[RATE] += rest / s[HEIGHT]
+        s = spring(c, where)
+        s.rate += rest / s.height
 
 
 @inner
@@ -191,37 +150,37 @@ def share_rate(c, g, i0, i1, rate, loose, flat, pushed, lossy):  # type: ignore[
 
     `lossy`: a stress of its springs depends on the strain rate, besides that of dashpots.
     """
-    soft, rest, climb, common = 0.0, rate, c.drive[VALUE_RATE], c.carried[g]
+    soft, rest, climb, common = 0.0, rate, c.drive.value_rate, c.carried[g]
     for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
-        if s[ETA] > 0.0:
-            if lossy and s[LOSSY] > 0.0:
+        s = spring(c, i)
+        if s.eta > 0.0:
+            if lossy and s.lossy > 0.0:
                 call_inside(c, LOSE, i, g, c.y, c.f, c.y, c.y)
             else:
-                s[RATE] = (common - s[TOTAL]) / s[ETA]
-            rest -= s[HEIGHT] * s[RATE]
+                s.rate = (common - s.total) / s.eta
+            rest -= s.height * s.rate
         elif flat < 0:
-            compliance = s[HEIGHT] / (s[GAIN] * s[TANGENT])
+            compliance = s.height / (s.gain * s.tangent)
             soft += compliance
-            rest += compliance * s[DRIFT]
+            rest += compliance * s.drift
     if loose < 0:
         _close(c, i0, i1, rest if not pushed else 0.0, pushed)
         return
     if not pushed and flat < 0:
         climb = rest / soft
     elif not pushed:
-        climb = past(c.springs, flat * c.width)[DRIFT]
+        climb = spring(c, flat).drift
     elif flat >= 0:
-        c.drive[FLAT] = 1.0
+        c.drive.flat = 1.0
     for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
-        if s[ETA] == 0.0 and i != flat:
-            slope = s[GAIN] * s[TANGENT]
-            s[RATE] = (climb - s[DRIFT]) / slope if slope > 0.0 else 0.0
-            rest -= s[HEIGHT] * s[RATE] if flat >= 0 else 0.0
+        s = spring(c, i)
+        if s.eta == 0.0 and i != flat:
+            slope = s.gain * s.tangent
+            s.rate = (climb - s.drift) / slope if slope > 0.0 else 0.0
+            rest -= s.height * s.rate if flat >= 0 else 0.0
     if flat >= 0:
-        past(c.springs, flat * c.width)[RATE] = 0.0 if pushed else (
-            rest / past(c.springs, flat * c.width)[HEIGHT]
+        spring(c, flat).rate = 0.0 if pushed else (
+            rest / spring(c, flat).height
         )  # fmt: skip
 
 
@@ -238,49 +197,49 @@ def derive_group(c, g, y, f):  # type: ignore[no-untyped-def]
     loose, soft, weight, flat = -1, 0.0, 0.0, -1
     last = g == c.groups - 1
     for i in range(i0, i1):
-        s = past(c.springs, i * c.width)
-        if s[ETA] > 0.0:
-            weight += s[HEIGHT] / s[LOSS]
+        s = spring(c, i)
+        if s.eta > 0.0:
+            weight += s.height / s.loss
             continue
         loose = i
-        if s[TANGENT] == 0.0:
+        if s.tangent == 0.0:
             flat = i
         else:
-            soft += s[HEIGHT] / (s[GAIN] * s[TANGENT])
+            soft += s.height / (s.gain * s.tangent)
     for i in range(i0, i1):  # of damped springs `total` becomes the whole derivative
         derive_spring(c, i, y)
         s, own, total = (
-            past(c.springs, i * c.width),
+            spring(c, i),
             past(c.own, 2 * i * p),
             past(c.part, (c.count + i) * p),
         )
-        slope, at, share = s[GAIN] * s[STEEP], c.numbers[i * NUMBERS + EPS_AT], 0.0
-        if s[ETA] > 0.0:
-            share = s[HEIGHT] / s[LOSS]
+        slope, at, share = s.gain * s.steep, numbers(c, i).eps_at, 0.0
+        if s.eta > 0.0:
+            share = s.height / s.loss
             for j in range(p):
                 total[j] += slope * y[c.base + at * p + j]
-            if s[LOSSY] > 0.0:
+            if s.lossy > 0.0:
                 call_inside(c, LOSSES, i, c.none, y, f, y, total)
         else:
             for j in range(p):
-                total[j] += own[p + j] * s[RATE]
+                total[j] += own[p + j] * s.rate
             if slope > 0.0:
-                share = s[HEIGHT] / slope
-        over = -s[RATE] if loose < 0 else 0.0
+                share = s.height / slope
+        over = -s.rate if loose < 0 else 0.0
         for j in range(p):
             if loose < 0:
                 rate[j] += share * total[j] + over * (own[j] - share * own[p + j])
-            elif s[ETA] > 0.0:
-                reach[j] -= s[EPS] * own[j] + s[HEIGHT] * y[c.base + at * p + j]
+            elif s.eta > 0.0:
+                reach[j] -= s.eps * own[j] + s.height * y[c.base + at * p + j]
             else:
-                reach[j] -= s[EPS] * own[j] - share * total[j]
+                reach[j] -= s.eps * own[j] - share * total[j]
     derive_common(c, last, loose, flat, soft, weight, reach, rate, out)
     for i in range(i0, i1):
         derive_share(c, i, y, f, i == flat, reach, out)
     if last and c.top == VISCOUS:
-        per, of_drag, top = 1.0 / c.drive[DRAGGED], past(c.own, 2 * c.count * p), c.base + 2 * g * p
+        per, of_drag, top = 1.0 / c.drive.dragged, past(c.own, 2 * c.count * p), c.base + 2 * g * p
         for j in range(p):
-            here = -per * (out[j] + of_drag[j] * c.drive[TOP_SPEED])
+            here = -per * (out[j] + of_drag[j] * c.drive.top_speed)
             f[top + j], f[top + p + j] = rate[j] if loose < 0 else here, 0.0
 
 
@@ -292,7 +251,7 @@ def derive_common(c, last, loose, flat, soft, weight, reach, rate, out):  # type
         for j in range(p):
             out[j] = 0.0
     elif loose < 0 and last and c.top == VISCOUS:
-        drag, speed = c.drive[DRAGGED], c.drive[TOP_SPEED]
+        drag, speed = c.drive.dragged, c.drive.top_speed
         for j in range(p):  # `rate` becomes that of the velocity of the top
             rate[j] = -(rate[j] + of_drag[j] * speed * weight) / (drag * weight + 1.0)
             out[j] = -drag * rate[j] - of_drag[j] * speed
@@ -311,25 +270,25 @@ def derive_common(c, last, loose, flat, soft, weight, reach, rate, out):  # type
 @inner
 def derive_share(c, i, y, f, is_flat, reach, out):  # type: ignore[no-untyped-def]
     """Fill the derivatives of the strain of a spring in a group of several; of its rate too."""
-    p, at = c.p, c.numbers[i * NUMBERS + EPS_AT]
+    p, at = c.p, numbers(c, i).eps_at
     s, own, total = (
-        past(c.springs, i * c.width),
+        spring(c, i),
         past(c.own, 2 * i * p),
         past(c.part, (c.count + i) * p),
     )
     strain, mine = past(c.strain, i * p), c.base + at * p
-    if s[ETA] > 0.0:
+    if s.eta > 0.0:
         for j in range(p):
             strain[j] = y[mine + j]
-            f[mine + j] = (out[j] - total[j] - s[RATE] * own[p + j]) / s[LOSS]
+            f[mine + j] = (out[j] - total[j] - s.rate * own[p + j]) / s.loss
     elif is_flat:
         for j in range(p):
-            strain[j] = reach[j] / s[HEIGHT]
+            strain[j] = reach[j] / s.height
     else:
-        slope = s[GAIN] * s[STEEP]
+        slope = s.gain * s.steep
         for j in range(p):
             strain[j] = (out[j] - total[j]) / slope if slope > 0.0 else 0.0
-    derive_inside(c, i, y, f, past(f, mine) if s[ETA] > 0.0 else strain)
+    derive_inside(c, i, y, f, past(f, mine) if s.eta > 0.0 else strain)
 
 
 @inner
@@ -342,19 +301,19 @@ def _mark_one_sided(c, g):  # type: ignore[no-untyped-def]
     p, flat, ready, common = c.p, 0, 0, past(c.common, g * c.p)
     first, last = (c.ends[g - 1] if g > 0 else 0), c.ends[g]
     for i in range(first, last):
-        s = past(c.springs, i * c.width)
-        ends = min(abs(s[EPS] - s[HIGH]), abs(s[EPS] - s[LOW])) < ROUNDED  # and may go on to one
-        flat += int(s[SIGMA_LOW] == s[SIGMA_HIGH] and s[ETA] == 0.0)
-        ready += int(s[SIGMA_LOW] < s[SIGMA_HIGH] and ends and s[ETA] == 0.0)
+        s = spring(c, i)
+        ends = min(abs(s.eps - s.high), abs(s.eps - s.low)) < ROUNDED  # and may go on to one
+        flat += int(s.sigma_low == s.sigma_high and s.eta == 0.0)
+        ready += int(s.sigma_low < s.sigma_high and ends and s.eta == 0.0)
     for i in range(first, last):
-        s, total = past(c.springs, i * c.width), past(c.part, (c.count + i) * p)
-        snaps = s[TURNS] != 0.0 and c.numbers[i * NUMBERS + KIND] == BY_STRESS
-        stands = snaps and abs(s[RATE]) * s[ETA] < STANDS * abs(c.carried[g])
+        s, total = spring(c, i), past(c.part, (c.count + i) * p)
+        snaps = s.turns != 0.0 and numbers(c, i).kind == BY_STRESS
+        stands = snaps and abs(s.rate) * s.eta < STANDS * abs(c.carried[g])
         for j in range(p):
             if stands and abs(common[j] - total[j]) > MOVES * max(abs(common[j]), abs(total[j])):
                 c.sided[j] = 1.0
             several = flat > 1 or (flat == 1 and ready > 0)
-            mine = c.directions[2 * j] == i and s[SIGMA_LOW] == s[SIGMA_HIGH] and s[ETA] == 0.0
+            mine = c.directions[2 * j] == i and s.sigma_low == s.sigma_high and s.eta == 0.0
             if several and mine and c.directions[2 * j + 1] in SNAPPING:
                 c.sided[j] = 1.0
 

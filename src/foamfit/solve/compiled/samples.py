@@ -7,52 +7,31 @@ of displacements: of all nodes, or of the top only.
 from __future__ import annotations
 
 from numba import cfunc, types
-from numba.extending import intrinsic
 
-from foamfit.solve.events import dense
-from foamfit.solve.motion import rates_of
-from foamfit.solve.run import (
-    BATCH,
-    GRAVITY,
-    KIND,
-    NOW,
-    RECORD,
-    SAMPLE,
-    STEP,
-    VALUE,
-    VALUE_RATE,
-    X_AT,
-    Z_AT,
-    unpack,
-)
+from foamfit.solve.compiled.events import dense
+from foamfit.solve.compiled.motion import rates_of
+from foamfit.solve.compiled.run import BATCH, RECORD, numbers, spring, unpack
 from foamfit.solve.scene import FREE, MOTION
 from foamfit.springs.compiled.contract import (
     BY,
     BY_HELD,
     BY_STRESS,
-    EPS,
-    ETA,
-    EVALUATE,
-    GAIN,
-    HEIGHT,
     INTERNAL,
     OF_LAW,
     OPTIONS,
-    PER_HEIGHT,
-    RATE,
     REAL,
     REALS_AT,
     RELAX,
     SLOPE,
     WHOLE,
     WHOLES_AT,
-    by_address,
     call_evaluate,
+    calling,
     inlined,
     inner,
     past,
-)  # fmt: skip
-from foamfit.springs.parameters import OWN_ETA, OWN_RELAXATION
+)
+from foamfit.springs.laws.record import OWN_ETA, OWN_RELAXATION
 
 INSIDE, FLIGHT, APPROACH = -1, -2, -3  # instead of the number of a sample
 
@@ -74,8 +53,8 @@ def place_nodes(c, g, y, reach):  # type: ignore[no-untyped-def]
 @inner
 def _rise(c, i, reach):  # type: ignore[no-untyped-def]
     """Add the elongation of a spring to derivatives of a displacement; return the elongation."""
-    s, p = past(c.springs, i * c.width), c.p
-    strain, own, height, eps = past(c.strain, i * p), past(c.own, 2 * i * p), s[HEIGHT], s[EPS]
+    s, p = spring(c, i), c.p
+    strain, own, height, eps = past(c.strain, i * p), past(c.own, 2 * i * p), s.height, s.eps
     for j in range(p):
         reach[j] += height * strain[j] + eps * own[j]
     return height * eps
@@ -109,7 +88,7 @@ def _write(c, y, at, k, want):  # type: ignore[no-untyped-def]
         if solved:
             _put(c, top, k, y[2 * g], past(y, c.base + 2 * g * p))
         elif c.top == MOTION:
-            _put(c, top, k, c.drive[VALUE] + c.drive[VALUE_RATE] * at, past(c.common, c.groups * p))
+            _put(c, top, k, c.drive.value + c.drive.value_rate * at, past(c.common, c.groups * p))
 
 
 # ---------------------------------------------------------------- many samples of one step
@@ -130,25 +109,25 @@ def polynomial(c, i, n, out):  # type: ignore[no-untyped-def]
 @inner
 def _write_batch(c, at, n):  # type: ignore[no-untyped-def]
     """Write n samples from `at` on: base stress of one spring, which is alone, and the top."""
-    s, own, top = past(c.springs, c.none), past(c.numbers, c.none), 2 * c.groups - 2
+    s, own, top = spring(c, 0), numbers(c, 0), 2 * c.groups - 2
     shares, time = c.batch, c.time
     eps, x, work = past(shares, BATCH), past(shares, 2 * BATCH), past(shares, 3 * BATCH)
     w, v, found = past(shares, 4 * BATCH), past(shares, 5 * BATCH), past(shares, 6 * BATCH)
-    per, eta, gain, dt, now = s[PER_HEIGHT], s[ETA], s[GAIN], c.now[STEP], c.now[NOW]
+    per, eta, gain, dt, now = s.per_height, s.eta, s.gain, c.now.step, c.now.now
     for k in range(n):
         shares[k] = (time[at + k] - now) / dt
     polynomial(c, c.none, n, w)
     polynomial(c, c.none + 1, n, v)
     for k in range(n):
         eps[k] = w[k] * per
-    if own[X_AT] >= 0:
-        polynomial(c, own[X_AT], n, x)
-    call_evaluate(own[EVALUATE], past(s, c.row), s, eps, x, n, int(c.p > 0), found)
+    if own.x_at >= 0:
+        polynomial(c, own.x_at, n, x)
+    call_evaluate(own.evaluate, past(s, c.row), s, eps, x, n, int(c.p > 0), found)
     sigma, stress = past(found, OF_LAW * n), past(row_of(c, c.none, c.none), at)
     for k in range(n):
         stress[k] = gain * sigma[k] + eta * per * v[k]
     for q in range(c.terms):
-        polynomial(c, own[Z_AT] + q, n, work)
+        polynomial(c, own.z_at + q, n, work)
         for k in range(n):
             stress[k] += s[RELAX + 2 * q] * work[k]
     if top > 0:
@@ -163,13 +142,13 @@ def _write_batch(c, at, n):  # type: ignore[no-untyped-def]
 @inner
 def _write_slope(c, j, at, n):  # type: ignore[no-untyped-def]
     """Write derivative j of the samples of `_write_batch`."""
-    s, own, p, top = past(c.springs, c.none), past(c.numbers, c.none), c.p, 2 * c.groups - 2
+    s, own, p, top = spring(c, 0), numbers(c, 0), c.p, 2 * c.groups - 2
     shares = c.batch
     eps, work, v = past(shares, BATCH), past(shares, 3 * BATCH), past(shares, 5 * BATCH)
     found = past(shares, 6 * BATCH)
     slope, sigma = past(found, SLOPE * n), past(found, OF_LAW * n)
     stress, motion = past(row_of(c, 1 + j, c.none), at), past(row_of(c, 1 + j, c.none + 1), at)
-    per, eta, gain, what = s[PER_HEIGHT], s[ETA], s[GAIN], c.directions[2 * j + 1]
+    per, eta, gain, what = s.per_height, s.eta, s.gain, c.directions[2 * j + 1]
     mine, of_height, of_eta = c.directions[2 * j] == 0, c.own[j], c.own[p + j]
     polynomial(c, c.base + j, n, work)
     for k in range(n):
@@ -179,7 +158,7 @@ def _write_slope(c, j, at, n):  # type: ignore[no-untyped-def]
         by = past(found, (BY + what) * n)
         for k in range(n):
             stress[k] += gain * by[k]
-    if own[KIND] == BY_STRESS:
+    if own.kind == BY_STRESS:
         held, ever, by = gain * c.held[j], gain * c.held[p + j], past(found, BY_HELD * n)
         for k in range(n):
             stress[k] += held * by[k] + ever * by[n + k]
@@ -189,11 +168,11 @@ def _write_slope(c, j, at, n):  # type: ignore[no-untyped-def]
         for k in range(n):
             stress[k] += per * (of_eta * v[k] + eta * (work[k] - of_height * per * v[k]))
     for q in range(c.terms):
-        polynomial(c, c.base + (own[Z_AT] + q) * p + j, n, work)
+        polynomial(c, c.base + (own.z_at + q) * p + j, n, work)
         for k in range(n):
             stress[k] += s[RELAX + 2 * q] * work[k]
         if mine and what == OWN_RELAXATION + 2 * q:
-            polynomial(c, own[Z_AT] + q, n, work)
+            polynomial(c, own.z_at + q, n, work)
             for k in range(n):
                 stress[k] += sigma[k] + work[k]
     if top > 0:
@@ -204,8 +183,8 @@ def _write_slope(c, j, at, n):  # type: ignore[no-untyped-def]
 def _write_inside(c, reached, want):  # type: ignore[no-untyped-def]
     """Write the samples of an impact up to a time inside the step."""
     r, t, n = c.now, c.time, c.base + c.carries * c.p
-    k, quick = int(r[SAMPLE]), c.shown == 2 and c.ends[0] == 1 and c.top == FREE and c.degree == 0
-    if quick and c.numbers[KIND] != INTERNAL:
+    k, quick = int(r.sample), c.shown == 2 and c.ends[0] == 1 and c.top == FREE and c.degree == 0
+    if quick and c.numbers.kind != INTERNAL:
         while k < c.samples and t[k] <= reached:
             last = k + 1
             while last < c.samples and last - k < BATCH and t[last] <= reached:
@@ -213,10 +192,10 @@ def _write_inside(c, reached, want):  # type: ignore[no-untyped-def]
             _write_batch(c, k, last - k)
             k = last
     while k < c.samples and t[k] <= reached:
-        dense(c, n, (t[k] - r[NOW]) / r[STEP], c.state)
+        dense(c, n, (t[k] - r.now) / r.step, c.state)
         _write(c, c.state, t[k], k, want)
         k += 1
-    r[SAMPLE] = k
+    r.sample = k
 
 
 # ---------------------------------------------------------------- without contact
@@ -225,13 +204,13 @@ def _write_inside(c, reached, want):  # type: ignore[no-untyped-def]
 @inner
 def _approach(c, speed):  # type: ignore[no-untyped-def]
     """Write the samples before contact, when only the striker moves."""
-    done, motion, t, gravity = c.none, row_of(c, c.none, c.shown - 1), c.time, c.drive[GRAVITY]
+    done, motion, t, gravity = c.none, row_of(c, c.none, c.shown - 1), c.time, c.drive.gravity
     while done < c.samples and t[done] < 0.0:
         for row in range((1 + c.p) * c.shown):
             c.out[row * c.samples + done] = 0.0
         motion[done] = (speed + 0.5 * gravity * t[done]) * t[done]
         done += 1
-    c.now[SAMPLE] = done
+    c.now.sample = done
 
 
 @inner
@@ -240,9 +219,9 @@ def _fly(c, slope):  # type: ignore[no-untyped-def]
 
     The chain moves with the striker. Derivatives include the shift of the end of contact.
     """
-    p, y, now, t, top = c.p, c.y, c.now[NOW], c.time, c.groups - 1
-    gravity = c.drive[GRAVITY]
-    speed, pull, first = y[2 * top + 1], c.stage[2 * top + 1], int(c.now[SAMPLE])
+    p, y, now, t, top = c.p, c.y, c.now.now, c.time, c.groups - 1
+    gravity = c.drive.gravity
+    speed, pull, first = y[2 * top + 1], c.stage[2 * top + 1], int(c.now.sample)
     for j in range(1 + p):
         stress = row_of(c, j, c.none)
         for k in range(first, c.samples):
@@ -252,7 +231,7 @@ def _fly(c, slope):  # type: ignore[no-untyped-def]
         place, quick = place_nodes(c, g, y, reach), y[2 * g - 1] if g > 0 else 0.0
         for i in range(c.ends[g - 1] if g > 0 else c.none, c.ends[g]):
             place += _rise(c, i, reach)
-            quick += past(c.springs, i * c.width)[HEIGHT] * past(c.springs, i * c.width)[RATE]
+            quick += spring(c, i).height * spring(c, i).rate
             if i == c.ends[g] - 1:
                 place, quick = y[2 * g], y[2 * g + 1]
                 for j in range(p):
@@ -291,9 +270,7 @@ def _samples(words, y, at, k, want):  # type: ignore[no-untyped-def]
 WRITE = _samples.address
 
 
-@intrinsic
-def _call_samples(typing, where, c, y, at, k, want):  # type: ignore[no-untyped-def]
-    return types.void(WHOLE, RECORD, REALS_AT, REAL, WHOLE, WHOLE), by_address
+_call_samples = calling(types.void, RECORD, REALS_AT, REAL, WHOLE, WHOLE)
 
 
 @inlined

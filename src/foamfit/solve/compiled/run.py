@@ -2,7 +2,8 @@
 
 `layout.lay_out` gives every array of a run its place, once per kind of scene. The record is a row
 of integers: addresses of arrays and functions, then sizes. Compiled functions read it by name:
-`c.springs` is a pointer, `c.count` a number.
+`c.springs` is a pointer, `c.count` a number, `spring(c, i).eps` the strain of a spring and
+`c.now.step` the length of the step.
 
 The state is one array. First come displacement w and velocity v of each node that has a state, then
 of each spring its strain if it has a dashpot and other springs lie between the same nodes, its
@@ -23,23 +24,23 @@ from numba.core.typing.templates import AttributeTemplate
 from numba.extending import infer_getattr, intrinsic, lower_getattr_generic, models, register_model
 
 from foamfit.springs.compiled.contract import (
-    BEGIN,
-    ETA,
-    GAIN,
-    HEIGHT,
-    LOSS,
-    PER_HEIGHT,
+    REAL,
     REALS_AT,
     RELAX,
+    SPRING,
     WHOLE,
     WHOLES_AT,
+    Named,
     address,
+    as_spring,
     call_begin,
+    inlined,
     inner,
     past,
+    pointing,
     start,
 )
-from foamfit.springs.parameters import DRAG, OWN_ETA, OWN_HEIGHT
+from foamfit.springs.laws.record import DRAG, OWN_ETA, OWN_HEIGHT
 
 # Arrays of floats: blocks of `width` numbers of the springs (see `compiled.contract`); area over
 # mass of the nodes; the drive now; stress of each group; derivatives of height and eta of each
@@ -64,14 +65,14 @@ FLOATS = (
 INTEGERS = ("numbers", "ends", "directions", "owned", "kinds", "pivots", "places", "groups_of")
 GIVEN = ("time", "values", "out", "log")  # arrays of the caller
 ADDRESSES = ("rates_at", "group_at", "inside_at", "change_at", "step_at", "drive_at", "write_at")
-# Place of the results of a law in a block, and of its row; width of a block; springs; groups; nodes
+# Place of the row of a law in a block; width of a block; springs; groups; nodes
 # with a state; derivatives; components of the state before the derivatives, if all are integrated,
 # and those that have derivatives; relaxation terms; top, see `solve.scene`; whether the rest of the
 # state is computed, not integrated; width of a row of stages; degree of the dense output if it is
 # the polynomial of an implicit step, else 0; see `order`; samples; rows of `out`; rows of `log`;
 # and 0, as a literal is of another type, for which functions would be compiled again.
 SIZES = (
-    "results", "row", "width", "count", "groups", "nodes", "p", "base", "carries", "terms", "top",
+    "row", "width", "count", "groups", "nodes", "p", "base", "carries", "terms", "top",
     "solved", "wide", "degree", "reach", "samples", "shown", "room", "none",
 )  # fmt: skip
 FIELDS = (*FLOATS, *INTEGERS, *GIVEN, *ADDRESSES, *SIZES)
@@ -84,7 +85,11 @@ _FLOATS_END, _INTEGERS_END = len(FLOATS), len(FLOATS) + len(INTEGERS)
 # Integers of a spring: the addresses of its law, kind, number of parameters and of internal
 # variables; the places of strain, internal variables and relaxation terms in the state (-1: none);
 # and whether the derivatives of its internal variables are those at a fixed strain, see `internal`.
-KIND, PARAMETERS, INTERNALS, EPS_AT, X_AT, Z_AT, FIXED, NUMBERS = 5, 6, 7, 8, 9, 10, 11, 12
+NUMBERS = (
+    "begin", "evaluate", "switch", "settle", "strain", "kind", "parameters", "internals", "eps_at",
+    "x_at", "z_at", "fixed",
+)  # fmt: skip
+OF_SPRING = len(NUMBERS)
 # Kinds of components of the state, which share a scale: displacement, velocity, strain, stress.
 # Then follow the strain of each spring, displacement and velocity of each node, and each internal
 # variable, which have scales of their own.
@@ -95,16 +100,20 @@ OF_W, OF_V, OF_EPS, OF_SIGMA, SCALES = range(5)
 # striker long before the springs, see `rates.is_overdamped`; base stress at the start of an
 # implicit step; stress on the top, and rate of the elongation of the group whose stress `internal`
 # solves for.
-VALUE, VALUE_RATE, TOP_SPEED, FLAT, DRAGGED, PACE, GRAVITY, OVERDAMPED, BEGINNING = range(9)
-PUSH, SPREAD, DRIVES = range(9, 12)
+DRIVE = (
+    "value", "value_rate", "top_speed", "flat", "dragged", "pace", "gravity", "overdamped",
+    "beginning", "push", "spread",
+)  # fmt: skip
 # Numbers that change during a run: time since the piece began, time at which it begins, step,
 # length of the piece, steps, growth of the next step, largest stress, whether the base stress has
 # risen, last error, next sample, number of the piece, switches; of implicit steps: length of the
 # one before, least length that the error can enforce, length of a short step, short steps in a row,
 # size of all vibrations that were damped out, and of those in the last steps; of explicit steps
 # along a drive: steps without an attempt at order 3.
-NOW, BEGUN, STEP, HORIZON, TAKEN, GROW, LARGEST, PRESSED, LAST, SAMPLE, PIECE, LOGGED = range(12)
-BEFORE, FLOOR, BRIEF, IN_ROW, DAMPED, DAMPING, PAUSED, RUN = range(12, 20)
+NOW = (
+    "now", "begun", "step", "horizon", "taken", "grow", "largest", "pressed", "last", "sample",
+    "piece", "logged", "before", "floor", "brief", "in_row", "damped", "damping", "paused",
+)  # fmt: skip
 BATCH = 64  # samples that are computed together
 # Rows of the stages; the row with the rates at the end of a step; rows of the dense output.
 STAGES, STEPPED, LINE = 16, 12, 7
@@ -123,8 +132,22 @@ RECORD = Run()
 register_model(Run)(models.OpaqueModel)
 
 
+def _named(name: str, kind: Any, fields: tuple[str, ...]) -> Any:
+    return Named(name, kind, {field: k for k, field in enumerate(fields)})
+
+
+_NUMBERS = _named("Numbers", WHOLE, NUMBERS)
+_TYPES = {
+    "springs": SPRING, "numbers": _NUMBERS, "drive": _named("Drive", REAL, DRIVE),
+    "now": _named("Now", REAL, NOW),
+}  # fmt: skip
+_as_numbers = pointing(_NUMBERS)
+
+
 def _type_of(name: str) -> Any:
     """Return the type of a field of the record."""
+    if name in _TYPES:
+        return _TYPES[name]
     if name in FLOATS or name in GIVEN:
         return types.CPointer(types.complex128) if name in ("systems", "right") else REALS_AT
     return WHOLES_AT if name in INTEGERS or name == "words" else WHOLE
@@ -161,6 +184,18 @@ def unpack(typing, words):  # type: ignore[no-untyped-def]
     return RECORD(WHOLES_AT), emit
 
 
+@inlined
+def spring(c, i):  # type: ignore[no-untyped-def]
+    """Return the block of a spring."""
+    return as_spring(past(c.springs, i * c.width))
+
+
+@inlined
+def numbers(c, i):  # type: ignore[no-untyped-def]
+    """Return the integers of a spring."""
+    return _as_numbers(past(c.numbers, i * OF_SPRING))
+
+
 @inner
 def begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals):  # type: ignore[no-untyped-def]
     """Fill the record of a run, set all springs at rest, and return the record.
@@ -179,19 +214,19 @@ def begin_run(template, ints, floats, time, values, out, log, rows, heights, mas
     c = unpack(words)
     terms, own = c.terms, rows.shape[1] - (c.width - c.row)  # first column of the laws
     for i in range(c.count):
-        s, n = past(c.springs, i * c.width), past(c.numbers, i * NUMBERS)
-        s[HEIGHT], s[PER_HEIGHT], s[ETA], s[GAIN] = heights[i], 1.0 / heights[i], rows[i, 0], 1.0
-        s[LOSS] = s[ETA]
+        s, n = spring(c, i), numbers(c, i)
+        s.height, s.per_height, s.eta, s.gain = heights[i], 1.0 / heights[i], rows[i, 0], 1.0
+        s.loss = s.eta
         for k in range(terms):
             s[RELAX + 2 * k], s[RELAX + 2 * k + 1] = rows[i, 1 + 2 * k], rows[i, 2 + 2 * k]
-            s[GAIN] += rows[i, 1 + 2 * k]
+            s.gain += rows[i, 1 + 2 * k]
         row = past(s, c.row)
         for k in range(own, rows.shape[1]):
             row[k - own] = rows[i, k]
-        call_begin(n[BEGIN], row, s)
+        call_begin(n.begin, row, s)
     for g in range(c.groups):
         c.per_mass[g] = 1.0 / mass[g]
-    c.drive[DRAGGED], c.drive[PACE] = reals[0], reals[1]
+    c.drive.dragged, c.drive.pace = reals[0], reals[1]
     for j in range(c.p):
         i, what = c.directions[2 * j], c.directions[2 * j + 1]
         if what == OWN_HEIGHT:

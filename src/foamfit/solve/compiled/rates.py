@@ -1,0 +1,148 @@
+"""Vibration and relaxation of a chain: what explicit steps must resolve and implicit ones miss."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.solve.compiled.run import spring
+from foamfit.solve.scene import FREE, STRESS, VISCOUS
+from foamfit.springs.compiled.contract import inner
+
+# Ratio of the rates of stopping and of creep above which dashpots stop a striker long before the
+# springs throw it back.
+OVERDAMPED = 1e3
+
+
+def contact_time(first: Array, eta: Array, heights: Array, mass: float, drag: float) -> float:
+    """Return a rough estimate of the duration of contact of a striker with the chain, s."""
+    soft = float(np.sum(heights / first))
+    return math.sqrt(mass * soft) + drag * soft + float(np.max(eta / first))
+
+
+def is_overdamped(first: Array, eta: Array, heights: Array, mass: float) -> bool:
+    """Whether dashpots stop a striker of that mass long before the springs throw it back.
+
+    With the rates a = k/c of creep and b = c/m of stopping, contact ends when the base stress has
+    fallen to (a/b)² of its peak, which explicit steps, with errors relative to the peak, miss.
+    """
+    if not eta.all():
+        return False
+    soft, flow = float(np.sum(heights / first)), float(np.sum(heights / eta))
+    return soft > OVERDAMPED * flow * flow * mass
+
+
+def fastest_rates(
+    first: Array,
+    steep: Array,
+    eta: Array,
+    heights: Array,
+    ends: Array,
+    mass: Array,
+    drag: float,
+    top: int,
+    struck: bool,
+    duration: float,
+) -> tuple[float, float]:
+    """Estimate the fastest vibration and relaxation of a scene, as rate times duration (radians).
+
+    `first` and `steep` are the slopes of the springs at rest and at most, `mass` that of the nodes;
+    both estimates are infinite if the scene `is_overdamped`.
+    """
+    if struck and is_overdamped(first, eta, heights, float(mass[-1])):
+        return math.inf, math.inf
+    vibration = relaxation = below_stiff = below_damp = 0.0
+    i0 = 0
+    for g, end in enumerate(ends.tolist()):
+        own, loose = slice(i0, end), eta[i0:end] == 0.0
+        # compliance of the springs without dashpot; the others are rigid at first
+        soft = float(np.sum((heights[own] / steep[own])[loose]))
+        damp = 0.0 if loose.any() else 1.0 / float(np.sum(heights[own] / eta[own]))
+        stiff = 1.0 / soft if soft > 0.0 else 0.0
+        if soft == 0.0 and end - i0 == 1:
+            stiff = float(steep[i0] / heights[i0])
+        elif end - i0 > 1 and not loose.all():
+            rest = steep[own] + heights[own] * stiff
+            relaxation = max(
+                relaxation, float(np.max((rest / np.where(loose, 1.0, eta[own]))[~loose]))
+            )
+        if g > 0:
+            relaxation = max(relaxation, (below_damp + damp) / float(mass[g - 1]))
+            vibration = max(vibration, math.sqrt((below_stiff + stiff) / float(mass[g - 1])))
+        below_stiff, below_damp, i0 = stiff, damp, end
+    if top == FREE:
+        relaxation = max(relaxation, (below_damp + drag) / float(mass[-1]))
+        vibration = max(vibration, math.sqrt(below_stiff / float(mass[-1])))
+    elif top == VISCOUS:
+        relaxation = max(relaxation, below_stiff / drag)
+        if below_damp > 1e4 * drag:  # v = (push - Σ)/drag loses its digits
+            relaxation = math.inf
+    if struck:
+        duration = min(duration, contact_time(first, eta, heights, float(mass[-1]), drag))
+    return vibration * duration, relaxation * duration
+
+
+# ---------------------------------------------------------------- during implicit steps
+
+
+@inner
+def stiffness_of(c, g, damped):  # type: ignore[no-untyped-def]
+    """Return the stiffness of a group or, if `damped`, its damping; 0 beyond both ends."""
+    if g >= c.groups or (g == c.groups - 1 and c.nodes < c.groups and c.top == STRESS):
+        return 0.0
+    soft = 0.0
+    for i in range(c.ends[g - 1] if g > 0 else 0, c.ends[g]):
+        s = spring(c, i)
+        part = s.eta if damped else s.gain * s.tangent
+        soft += s.height / part if part > 0.0 else math.inf
+    return 1.0 / soft
+
+
+@inner
+def is_unresolved(c, span):  # type: ignore[no-untyped-def]
+    """Whether a mass vibrates too fast for a step and keeps vibrating after it."""
+    for g in range(c.nodes):
+        own = math.sqrt((stiffness_of(c, g, False) + stiffness_of(c, g + 1, False)) * c.per_mass[g])
+        fade = 0.5 * c.per_mass[g] * (stiffness_of(c, g, True) + stiffness_of(c, g + 1, True))
+        if own * span > 0.5 and fade < own and fade * span < 20.0 and c.top != VISCOUS:
+            return True
+    return False
+
+
+@inner
+def remember(c, span, wait):  # type: ignore[no-untyped-def]
+    """Add the vibrations that a step was too long to resolve to those the response lacks.
+
+    A mass whose velocity differs by δv from the initial velocity of the step's polynomial then
+    vibrates with amplitude δv/ω. `alive` (groups, 2) sums δv/√ω over all steps, because a vibration
+    whose stiffness changes slowly conserves energy over frequency, and keeps the decay rate of the
+    slowest: in a row of masses the slowest unresolved vibration decays last, with the amplitude of
+    all of them together. `worst` (motion, stress) includes the vibration left after `wait`, at the
+    first sample that may show it.
+    """
+    motion = stress = 0.0
+    alive, worst = c.alive, c.worst
+    row = math.sin(0.5 * math.pi / max(c.nodes, 2))
+    for g in range(c.nodes):
+        below, above = stiffness_of(c, g, False), stiffness_of(c, g + 1, False)
+        damping = stiffness_of(c, g, True) + stiffness_of(c, g + 1, True)
+        damping += c.drive.dragged if g == c.groups - 1 else 0.0
+        own = math.sqrt((below + above) * c.per_mass[g])
+        fade, root = 0.5 * damping * c.per_mass[g], math.sqrt(own)
+        if (g == c.groups - 1 and c.top != FREE) or own == 0.0:
+            continue
+        started = 0.0
+        if own * span > 2.0 and fade < own:
+            started = abs(c.line[2 * g] - span * c.y[2 * g + 1]) / span / root
+            slow = fade * min(max(2.0 * row * row, 4.0 / (own * span) ** 2), 1.0)
+            lasting = alive[2 * g] > 1e-3 * started
+            alive[2 * g + 1] = min(slow, alive[2 * g + 1]) if lasting else slow
+            alive[2 * g] += started
+        if alive[2 * g] > 0.0:
+            size = alive[2 * g] / root * math.exp(-alive[2 * g + 1] * wait)
+            motion += size
+            stress = max(stress, max(below, above) * size)
+            alive[2 * g] *= math.exp(-alive[2 * g + 1] * span)
+    worst[0], worst[1] = max(worst[0], motion), max(worst[1], stress)

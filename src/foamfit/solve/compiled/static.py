@@ -1,0 +1,264 @@
+"""Undamped, massless springs in series: a common stress, along a motion or a stress history.
+
+Along a monotone part of the motion the strain of each spring is a monotone function of the common
+stress. The springs are followed from one end of a branch to the next; between them the sum of their
+elongations has one root, and no integration in time is needed.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from foamfit.solve.compiled.events import change_branch
+from foamfit.solve.compiled.motion import ONLY_DERIVATIVES, evaluate, rates_of
+from foamfit.solve.compiled.run import begin_run, numbers, spring
+from foamfit.solve.compiled.samples import row_of
+from foamfit.solve.scene import STRESS
+from foamfit.springs.compiled.contract import BY_STRESS, OPTIONS, call_number, inner, past
+
+LEAST = 1e-6  # strain to whose rounding error elongations are always resolved
+MOST_SWITCHES = 100_000  # of all springs between two samples
+
+
+@inner
+def put(c, i, eps, sigma):  # type: ignore[no-untyped-def]
+    """Bring a spring to a strain and stress of its branch."""
+    s = spring(c, i)
+    s.eps = eps
+    if numbers(c, i).kind == BY_STRESS:
+        s.x = (sigma - s.offset) / s.gain
+
+
+@inner
+def strain_at(c, i, sigma):  # type: ignore[no-untyped-def]
+    """Return the strain of a spring at a stress T on its branch; fill SOFT."""
+    s, n = spring(c, i), numbers(c, i)
+    return call_number(n.strain, past(s, c.row), s, (sigma - s.offset) / s.gain)
+
+
+@inner
+def elongation_at(c, i0, i1, sigma, loose):  # type: ignore[no-untyped-def]
+    """Return elongation, compliance, and size of the terms at a stress on the branches.
+
+    With `loose`, only of the springs without a dashpot.
+    """
+    total = compliance = size = 0.0
+    for i in range(i0, i1):
+        s = spring(c, i)
+        if loose and s.eta > 0.0:
+            continue
+        eps = strain_at(c, i, sigma)
+        total += s.height * eps
+        compliance += s.height * s.soft / s.gain
+        size += s.height * max(abs(eps), LEAST)
+    return total, compliance, size
+
+
+@inner
+def _split_jump(c, i0, i1, target, low, high, loose):  # type: ignore[no-untyped-def]
+    """Distribute an elongation inside a jump between two stresses from the base up."""
+    rest = target - elongation_at(c, i0, i1, low, loose)[0]
+    for i in range(i0, i1):
+        s = spring(c, i)
+        if loose and s.eta > 0.0:
+            continue
+        upper, eps = strain_at(c, i, high), strain_at(c, i, low)
+        gain = min(max(rest / s.height, 0.0), upper - eps)
+        put(c, i, eps + gain, 0.5 * (low + high))
+        rest -= s.height * gain
+    return 0.5 * (low + high)
+
+
+@inner
+def root(c, i0, i1, target, sigma, low, high, loose):  # type: ignore[no-untyped-def]
+    """Return the stress between two bounds at which springs reach an elongation; fill strains.
+
+    Newton's method inside a bracket, which every third trial halves.
+    """
+    for trial in range(400):
+        total, compliance, size = elongation_at(c, i0, i1, sigma, loose)
+        miss = total - target
+        if abs(miss) <= 2e-15 * (size + abs(target)):
+            break
+        if miss > 0.0:
+            high = min(high, sigma)
+        else:
+            low = max(low, sigma)
+        new = sigma - miss / compliance
+        if not low < new < high or (trial >= 8 and trial % 3 == 0):
+            if low > -math.inf and high < math.inf:
+                new = 0.5 * (low + high)
+            elif not low < new < high:
+                new = sigma + (2.0 if miss < 0.0 else -2.0) * max(
+                    abs(sigma), abs(miss / compliance)
+                )
+            if new in (low, high):  # neighbouring floating-point numbers
+                return _split_jump(c, i0, i1, target, low, high, loose)
+        sigma = new
+    for i in range(i0, i1):
+        if not (loose and spring(c, i).eta > 0.0):
+            put(c, i, strain_at(c, i, sigma), sigma)
+    return sigma
+
+
+# ---------------------------------------------------------------- along a history
+
+
+@inner
+def push_to(c, i, sigma, before, y):  # type: ignore[no-untyped-def]
+    """Bring a spring to a stress, from the stress `before`."""
+    s, way = spring(c, i), 1.0 if sigma > before else -1.0
+    for _ in range(MOST_SWITCHES):
+        if sigma != before and s.turns * way < 0.0:
+            change_branch(c, i, int(way > 0.0), y)
+        elif sigma > s.sigma_high and s.high < math.inf:
+            change_branch(c, i, 1, y)
+        elif sigma < s.sigma_low and s.low > -math.inf:
+            change_branch(c, i, int(c.none), y)
+        else:
+            break
+    put(c, i, strain_at(c, i, sigma), sigma)
+
+
+@inner
+def strain_to(c, i, eps, y):  # type: ignore[no-untyped-def]
+    """Bring a spring to a strain."""
+    s, n = spring(c, i), numbers(c, i)
+    for _ in range(MOST_SWITCHES):
+        up = eps > s.eps
+        if eps != s.eps and s.turns * (1.0 if up else -1.0) < 0.0:
+            change_branch(c, i, int(up), y)
+        elif eps > s.high or eps < s.low:
+            change_branch(c, i, int(eps > s.high), y)
+        else:
+            break
+    call_number(n.settle, past(s, c.row), s, eps)
+
+
+@inner
+def elongation(c, i0, i1):  # type: ignore[no-untyped-def]
+    """Return the elongation of springs at their present strains."""
+    total = 0.0
+    for i in range(i0, i1):
+        s = spring(c, i)
+        total += s.height * s.eps
+    return total
+
+
+@inner
+def _yield_flat(c, i0, i1, rest, y):  # type: ignore[no-untyped-def]
+    """Let springs on flat branches take an elongation, from the base up; return what is left.
+
+    One that reaches the end of its branch leaves it; the second value says so.
+    """
+    up = rest > 0.0
+    for i in range(i0, i1):
+        s = spring(c, i)
+        if s.sigma_low != s.sigma_high or rest == 0.0:
+            continue
+        room = s.height * ((s.high if up else s.low) - s.eps)
+        if abs(rest) <= abs(room):
+            s.eps += rest / s.height
+            return 0.0, False
+        change_branch(c, i, int(up), y)
+        return rest, True
+    return rest, False
+
+
+@inner
+def bring(c, i0, i1, target, common, y):  # type: ignore[no-untyped-def]
+    """Bring springs in series to an elongation, from a common stress; return that stress."""
+    for _ in range(MOST_SWITCHES):
+        rest = target - elongation(c, i0, i1)
+        if rest == 0.0:
+            break
+        up, turned = rest > 0.0, False
+        for i in range(i0, i1):
+            if spring(c, i).turns * (1.0 if up else -1.0) < 0.0:
+                change_branch(c, i, int(up), y)
+                turned = True
+        if turned:
+            continue
+        rest, left = _yield_flat(c, i0, i1, rest, y)
+        if left:
+            continue
+        if rest == 0.0:
+            break
+        limit = math.inf if up else -math.inf
+        for i in range(i0, i1):
+            s = spring(c, i)
+            limit = min(limit, s.sigma_high) if up else max(limit, s.sigma_low)
+        limit = max(limit, common) if up else min(limit, common)
+        if abs(limit) < math.inf:
+            beyond = target - elongation_at(c, i0, i1, limit, c.none)[0]
+            if (beyond > 0.0) if up else (beyond < 0.0):
+                common = limit
+                for i in range(i0, i1):
+                    put(c, i, strain_at(c, i, limit), limit)
+                for i in range(i0, i1):
+                    s = spring(c, i)
+                    if (s.sigma_high <= limit) if up else (s.sigma_low >= limit):
+                        change_branch(c, i, int(up), y)
+                continue
+        return root(c, i0, i1, target, common, min(common, limit), max(common, limit), c.none)
+    return common
+
+
+@inner
+def _bring_all(c, k, before):  # type: ignore[no-untyped-def]
+    """Bring the chain to sample k of its drive, from a common stress; return that stress."""
+    now = c.values[k]
+    if c.top == STRESS:
+        for i in range(c.count):
+            push_to(c, i, now, before, c.y)
+    else:
+        now = bring(c, c.none, c.count, now, before, c.y)
+    return now
+
+
+@inner
+def _write(c, k, now):  # type: ignore[no-untyped-def]
+    """Write sample k: the common stress, displacements, and their derivatives."""
+    p, place, reach = c.p, 0.0, past(c.common, 3 * c.p)  # with one group, the last of the rows
+    if p > 0:
+        for i in range(c.count):
+            s = spring(c, i)
+            evaluate(c, i, 1 + c.none)
+            s.tangent, s.total = s.slope, s.sigma
+        c.carried[0] = now
+        rates_of(c, c.none, c.y, c.f, ONLY_DERIVATIVES, 0.0)
+    row_of(c, c.none, c.none)[k] = now
+    for j in range(p):
+        row_of(c, 1 + j, c.none)[k], reach[j] = c.common[j], 0.0
+    for i in range(c.count):
+        s, strain, own = spring(c, i), past(c.strain, i * p), past(c.own, 2 * i * p)
+        place += s.height * s.eps
+        for j in range(p):
+            reach[j] += s.height * strain[j] + s.eps * own[j]
+        if c.shown > 2 or i == c.count - 1:
+            node = 1 + i if c.shown > 2 else c.shown - 1
+            row_of(c, c.none, node)[k] = place
+            for j in range(p):
+                row_of(c, 1 + j, node)[k] = reach[j]
+
+
+@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
+def balance(  # type: ignore[no-untyped-def]
+    template, ints, floats, rows, heights, mass, reals, values, time, out, log, history
+):  # fmt: skip
+    """Follow undamped, massless springs in series along a motion or stress of the top.
+
+    `history` (2, springs, n) becomes strains and branches.
+    """
+    c = begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals)
+    before = 0.0
+    for i in range(c.count):
+        evaluate(c, i, int(c.p > 0))
+    for k in range(c.samples):
+        before = _bring_all(c, k, before)
+        _write(c, k, before)
+        for i in range(c.count):
+            s = spring(c, i)
+            history[0, i, k], history[1, i, k] = s.eps, s.branch
