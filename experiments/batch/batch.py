@@ -1,14 +1,10 @@
-"""What is the overhead of `foamfit batch`? Speed-up, overhead per test, memory, an estimate.
+"""What is the overhead of `foamfit batch`? Speed-up, overhead per test, memory.
 
-Method. Synthetic impacts on one spring with 1 % noise are fitted by the command and by its parts.
-Other work on the machine slows everything, so processor times are given with wall-clock times.
-
-Answer. 26 ms of processor time per test, constant memory, the same numbers with any number of
-processes. Results go to batch.json; README.md describes them.
+Method and answer: README.md, whose numbers are in batch.json. Other work on the machine slows
+everything, so processor times are given with wall-clock times.
 
     python experiments/batch/batch.py               # all, some 15 minutes on two idle cores
     python experiments/batch/batch.py speedup       # one of them; see MEASURES
-
 """
 
 from __future__ import annotations

@@ -1,15 +1,8 @@
 """What changes from cycle to cycle? Twins of a shoe foam, and printed lattices up to cycle 1000.
 
-Method. shoe-foam-twins/ (arXiv:2602.12694, LivingMatterLab/CANN) contains five specimens each of
-the heel of a new and of a worn shoe, compressed 6 times; lattice-cycles/ (printed TPU lattices,
-mev43/FYP-Cyclic-Compression-Data-Analysis) contains 145 recorded cycles of 1000. Every cycle is
-fitted on its own with a microscale spring with relaxation. The measurements are not part of this
-repository.
+Method and answer: README.md. Also written: twins.csv, lattice.csv and lattice.png.
 
-Answer. Snap-through and relaxation change from cycle to cycle: README.md. Also written:
-twins.csv, lattice.csv and lattice.png.
-
-    FOAMFIT_DATA=path/to/data python experiments/damage/damage.py
+    FOAMFIT_DATA=… python experiments/damage/damage.py
 """
 
 from __future__ import annotations

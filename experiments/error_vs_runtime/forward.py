@@ -1,13 +1,8 @@
 """How much time does a simulation of given accuracy take? Error against run time, by scene.
 
-Method. For every scene of `scenes.py`, the errors of foamfit's solver, of fixed-step schemes and of
-three SciPy integrators against the judge of the stability study (`independent.py`, some 14 digits)
-are plotted over the median time of many runs. All solvers of a scene alternate in one process, and
-processor time is measured, so that a busy machine affects all of them equally; ratios compare
-medians of one run. A table and a figure per scene and summary.csv go to `forward/`.
-
-Answer. For an error below 2e-6 foamfit takes 24 µs to 17 ms, SciPy 14 to 170 times as long:
-README.md.
+Method and answer: README.md. All solvers of a scene alternate in one process, and processor time is
+measured, so that a busy machine affects all of them equally; ratios compare medians of one run. A
+table and a figure per scene and summary.csv go to `forward/`.
 
     python experiments/error_vs_runtime/forward.py                      # all: about 5 minutes
     python experiments/error_vs_runtime/forward.py one_spring_impact    # some scenes, no page

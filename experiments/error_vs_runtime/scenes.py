@@ -5,7 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +16,7 @@ import foamfit as ff
 import restarted
 import restarted_memory
 import written_law
-from foamfit.solve.plan import Plan, plan
+from foamfit.solve.plan import plan
 from foamfit.springs.chain import Drive
 
 sys.path.append(str(Path(__file__).parents[1] / "stability"))
@@ -22,6 +24,8 @@ import independent
 
 Array = np.ndarray
 Answer = tuple[Array, Array]  # displacement of the top (m) and base stress (Pa), (n,) each
+# Fixed-step schemes by number of steps, and SciPy's integrators by method and rtol.
+Rivals = tuple[dict[str, Callable[[int], Answer]], Callable[[str, float], Answer]]
 
 SAMPLES, LENGTH = 501, 0.8e-3
 MASS = 7e-3
@@ -35,10 +39,9 @@ PUBLIC, KERNEL = "foamfit simulate", "foamfit kernel"
 class Scene:
     """A chain under a drive, and the settings of each solver.
 
-    Attributes ---------- own, outside : sequences of float Tolerances of foamfit and of SciPy.
-    substeps : sequence of int Steps of the fixed-step schemes between two samples. longest : float
-    Time limit, s: no further setting is tried after one that takes longer. looks : int See
-    `restarted.impact`.
+    `own` and `outside` are tolerances of foamfit and of SciPy, `substeps` the steps of fixed-step
+    schemes between two samples. No setting is tried after one that takes `longest` (s). `looks` is
+    that of `restarted.impact`.
     """
 
     name: str
@@ -70,13 +73,6 @@ def graded(count: int, mass: float = 0.0, eta: float = 0.0) -> ff.Chain:
     ]  # fmt: skip
     masses = [mass / max(count - 1, 1)] * (count - 1) + [0.0]
     return ff.Chain(springs, [HEIGHT / count] * count, AREA, masses)
-
-
-def loop(spring: ff.BistableSpring, samples: int, by_stress: bool) -> Array:
-    """Return a history past C1 and back: stress (Pa) or strain, (samples,)."""
-    most = 1.15 * spring.sigma_hat_c if by_stress else 1.05 * spring.eps_hat_c
-    s = np.linspace(0.0, 1.0, samples)
-    return most * np.where(s < 0.5, np.sin(np.pi * s) ** 2, np.sin(np.pi * s) ** 4)
 
 
 def scenes() -> list[Scene]:
@@ -148,6 +144,13 @@ class Competitor:
     run: Callable[[], Answer]
 
 
+def _ladder(
+    family: str, run: Callable[[Any], Answer], values: Sequence[Any], text: str = "rtol = {:.0e}"
+) -> dict[str, list[Competitor]]:
+    """Return a solver at several settings."""
+    return {family: [Competitor(family, text.format(v), partial(run, v)) for v in values]}
+
+
 def own(scene: Scene) -> dict[str, list[Competitor]]:
     """Return foamfit's solvers: `simulate`, and the bare `Plan.run` that a fit calls."""
     made = plan(scene.chain, scene.drive, scene.time)
@@ -161,96 +164,73 @@ def own(scene: Scene) -> dict[str, list[Competitor]]:
         motion = made.run(rows, heights, rtol, everything=False)
         return motion.displacement[-1], motion.base_stress
 
-    return {
-        family: [
-            Competitor(
-                family,
-                f"rtol = {rtol:.0e}",
-                lambda rtol=rtol, function=function: function(rtol),
-            )
-            for rtol in scene.own
-        ]
-        for family, function in ((PUBLIC, public), (KERNEL, kernel))
-    }
+    return _ladder(PUBLIC, public, scene.own) | _ladder(KERNEL, kernel, scene.own)
 
 
 def others(scene: Scene) -> dict[str, list[Competitor]]:
     """Return the fixed-step schemes and SciPy's integrators."""
-    if isinstance(scene.chain.springs[-1], ff.MicroscaleSpring):
-        return _memory(scene)
-    rows, heights = written_law.rows_of(scene.chain), np.array(scene.chain.heights)
-    made = plan(scene.chain, scene.drive, scene.time)
-    return _impact(scene, made, rows, heights)
+    if not isinstance(scene.chain.springs[-1], ff.MicroscaleSpring):
+        fixed, outside = _bistable(scene)
+    elif isinstance(scene.drive, ff.Impact):
+        fixed, outside = _microscale_impact(scene)
+    else:
+        fixed, outside = _microscale_displacement(scene)
+    out, steps = dict[str, list[Competitor]](), [n * (scene.time.size - 1) for n in scene.substeps]
+    for name, run in fixed.items():
+        out |= _ladder(name, run, steps, "{} steps")
+    for method in restarted.METHODS:
+        out |= _ladder(f"SciPy {method}", partial(outside, method), scene.outside)
+    return out
 
 
-def _impact(scene: Scene, made: Plan, rows: Array, heights: Array) -> dict[str, list[Competitor]]:
-    t = scene.time
+def _bistable(scene: Scene) -> Rivals:
+    rows, heights, t = written_law.rows_of(scene.chain), np.array(scene.chain.heights), scene.time
+    made = plan(scene.chain, scene.drive, t)
 
-    def fixed(scheme: int, substeps: int) -> Answer:
+    def fixed(scheme: int, steps: int) -> Answer:
         out = np.zeros(t.size), np.zeros(t.size)
         given = rows, heights, np.array(made.ends), made.mass, made.drag, made.speed, t
-        fixed_step.impact(*given, substeps, scheme, *out)
+        fixed_step.impact(*given, steps // (t.size - 1), scheme, *out)
         return out
 
     def outside(method: str, rtol: float) -> Answer:
         system = restarted.System(rows, heights, made.mass, made.drag, made.speed)
         return restarted.impact(system, t, method, rtol, scene.looks)
 
-    schemes = (fixed_step.VERLET, fixed_step.RK4)
-    return _ladders(scene, [(fixed_step.NAMES[s], s) for s in schemes], fixed, outside)
+    return {name: partial(fixed, k) for k, name in enumerate(fixed_step.NAMES)}, outside
 
 
-def _memory(scene: Scene) -> dict[str, list[Competitor]]:
-    """Return solvers of a microscale spring, alone or on a linear one: impact or displacement."""
+def _microscale_impact(scene: Scene) -> Rivals:
+    """Return solvers of a microscale spring, alone or on a linear one."""
     t, drive = scene.time, scene.drive
-    if isinstance(drive, ff.Impact):
-        row = restarted_memory.row_of(scene.chain, drive.mass)
+    row = restarted_memory.row_of(scene.chain, drive.mass)
 
-        def fixed(scheme: int, substeps: int) -> Answer:
-            out = np.zeros(t.size), np.zeros(t.size)
-            restarted_memory.runge_kutta(row, drive.velocity, t, substeps, *out)
-            return out
+    def fixed(steps: int) -> Answer:
+        out = np.zeros(t.size), np.zeros(t.size)
+        restarted_memory.runge_kutta(row, drive.velocity, t, steps // (t.size - 1), *out)
+        return out
 
-        def outside(method: str, rtol: float) -> Answer:
-            system = restarted_memory.MemorySystem(row, drive.velocity)
-            return restarted.impact(system, t, method, rtol, scene.looks)
+    def outside(method: str, rtol: float) -> Answer:
+        system = restarted_memory.MemorySystem(row, drive.velocity)
+        return restarted.impact(system, t, method, rtol, scene.looks)
 
-        return _ladders(scene, [("Runge-Kutta 4", 0)], fixed, outside)
-    assert isinstance(drive, ff.DisplacementDrive)
-    row, motion = restarted_memory.row_of(scene.chain), np.array(drive.displacement)
+    return {"Runge-Kutta 4": fixed}, outside
+
+
+def _microscale_displacement(scene: Scene) -> Rivals:
+    t, row = scene.time, restarted_memory.row_of(scene.chain)
+    motion = np.array(scene.drive.displacement)
     eps = motion / scene.chain.height
 
-    def by_hand(scheme: int, substeps: int) -> Answer:
+    def by_hand(steps: int) -> Answer:
         out = np.zeros(t.size)
-        restarted_memory.recursion(row, t, eps, substeps, out)
+        restarted_memory.recursion(row, t, eps, steps // (t.size - 1), out)
         return motion, out
 
-    def integrated(method: str, rtol: float) -> Answer:
+    def outside(method: str, rtol: float) -> Answer:
         return motion, restarted_memory.along_displacement(row, t, eps, method, rtol)
 
-    return _ladders(scene, [("exponential recursion", 0)], by_hand, integrated)
-
-
-def _ladders(
-    scene: Scene,
-    schemes: Sequence[tuple[str, int]],
-    fixed: Callable[[int, int], Answer],
-    outside: Callable[[str, float], Answer],
-) -> dict[str, list[Competitor]]:
-    intervals = scene.time.size - 1
-    out = {}
-    for family, scheme in schemes:
-        out[family] = [
-            Competitor(family, f"{n * intervals} steps", lambda s=scheme, n=n: fixed(s, n))
-            for n in scene.substeps
-        ]
-    for method in restarted.METHODS:
-        family = f"SciPy {method}"
-        out[family] = [
-            Competitor(family, f"rtol = {rtol:.0e}", lambda m=method, r=rtol: outside(m, r))
-            for rtol in scene.outside
-        ]
-    return out
+    return {"exponential recursion": by_hand}, outside
 
 
 def reference(scene: Scene) -> Answer:

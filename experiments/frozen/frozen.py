@@ -1,12 +1,6 @@
 """Does a code change alter results? Fits, simulations, a joint fit and a prediction.
 
-Method. The reconstructions of the repository and synthetic records (`experiments/recovery/rig.py`,
-with an independent integrator) are processed like those of a user: CSV, TOML, `foamfit.read_test`,
-the defaults of `foamfit.fit`. Values, standard errors, ends of intervals, states, misfits, and
-features of simulated curves are compared with frozen.csv. The tolerance is 1e-9 (relative) for a
-simulation, a hundredth of the standard error for a fitted number and 1e-3 for the rest.
-
-Answer. The list of differences, if any.
+Method and tolerances: README.md. The answer is the list of differences, if any.
 
     python experiments/frozen/frozen.py            # compare with frozen.csv; exit code 1 if changed
     python experiments/frozen/frozen.py --renew    # write frozen.csv

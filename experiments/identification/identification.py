@@ -1,20 +1,11 @@
 """How many problems do foamfit's search and eight methods of lmfit solve in a few seconds?
 
-Method. Every method minimises the same residual (`fitting.objective.Objective`) of the same
-problems for the same time. The lowest cost so far is recorded against the processor time of the
-single thread. Local methods start at random points of the search box (`fitting.search.box_starts`),
-one after the other until the time is up; global methods and `foamfit.fit` restart likewise. A run
-also ends once its cost is within 0.1 % of the best known. The eight methods run twice: in the
-`lmfit.Parameters` of `foamfit.make_params` (SI values and bounds, as a user of lmfit would write
-them), and in the coordinates of foamfit's search, in which every point is admissible.
-
-Answer. `foamfit.fit` solves all problems in 3 s: README.md.
+Method and answer: README.md. Also written: runs.csv.gz (every improvement by more than 2 %, and
+when a problem was solved), runs.json (machine, settings) and figures. Without FOAMFIT_DATA the shoe
+foam is omitted.
 
     FOAMFIT_DATA=… python experiments/identification/identification.py    # 35 min of one core
     python experiments/identification/identification.py --redraw          # figures and page only
-
-Writes runs.csv.gz (every improvement by more than 2 %, and when a problem was solved) and runs.json
-(machine, settings), then README.md and figures. Without FOAMFIT_DATA the shoe foam is omitted.
 """
 
 # ruff: noqa: E402  (the number of threads is read when NumPy is imported)

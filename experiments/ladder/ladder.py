@@ -1,19 +1,9 @@
 """Does `--model auto` find the true structure of a test?
 
-Method. Synthetic impacts on chains of known structure, 401 samples, white noise of 0.5-1 % of the
-range on stress and displacement; springs, heights and velocities are random. Twenty tests of each
-structure are fitted by `foamfit.fit(test, model="auto")` with its defaults. A test is called clear,
-from the simulation alone and before the fit, if
+Method and answer: README.md. Also written: structures.csv (a row for each test).
 
-- every bistable spring passes through branches a, d, c and e;
-- with damping, dashpots dissipate at least 5 % of the striker's energy;
-- every simpler model, fitted to the noise-free curves, has a misfit (RMS over both curves) of at
-  least half the noise, so that chi-square is at least a quarter above the floor.
-
-Answer. It finds 82 of 83 clear tests: see README.md.
-
-    python experiments/ladder/ladder.py              # table and README
-    python experiments/ladder/ladder.py --tests 2
+    python experiments/ladder/ladder.py              # --page: from the table alone
+    python experiments/ladder/ladder.py --tests 2 --out FOLDER
 """
 
 from __future__ import annotations

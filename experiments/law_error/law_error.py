@@ -1,15 +1,9 @@
 """Does `ci95` contain the best noise-free fit of a law if the foam follows another law?
 
-Method. Synthetic tests of one law are fitted by another, a bistable spring: a microscale spring
-with relaxation, a bistable spring whose kinks are rounded, and one whose stress depends on the
-rate. Each is measured repeatedly with new noise, written to CSV and TOML, read and fitted with the
-defaults. `ci95` should contain the best fit of the curves without noise. Tests of the bistable
-spring itself show the result without model error.
-
-Answer. Yes, in 92 to 98 % of the draws of each kind: README.md.
+Method and answer: README.md. Also written: law_error.csv.
 
     python experiments/law_error/law_error.py                # 200 draws each
-    python experiments/law_error/law_error.py --draws 20
+    python experiments/law_error/law_error.py --draws 20 --out FOLDER
 """
 
 from __future__ import annotations

@@ -1,16 +1,9 @@
 """Do springs that remember describe all cycles of a foam with one set of parameters?
 
-Method. Running-shoe foam (arXiv:2602.12694, LivingMatterLab/CANN): 14 first cycles are fitted with
-one relaxation term, stiffening, softening and weakening; cycles 1 to 3 of the 11 specimens with
-several cycles are fitted as one history with two relaxation terms; cycles 4 and 5 are predicted
-from that fit. The measurements are not part of this repository; FOAMFIT_DATA contains shoe-foam/
-and shoe-foam-twins/.
+Method and answer: README.md. Also written: memory.csv (a row for each cycle of each specimen),
+parameters.csv (every parameter of every fit), ways_back.csv and memory.png.
 
-Answer. Yes: cycles 1 to 3 are fitted within 0.6 %, cycles 4 and 5 predicted within 1 %. The study
-writes README.md, memory.csv (a row for each cycle of each specimen), parameters.csv (every
-parameter of every fit) and memory.png.
-
-    FOAMFIT_DATA=path/to/data python experiments/memory/memory.py
+    FOAMFIT_DATA=… python experiments/memory/memory.py          # --page: from the tables alone
 """
 
 from __future__ import annotations

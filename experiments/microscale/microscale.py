@@ -1,11 +1,6 @@
 """Do discrete micro-springs converge to the microscale spring, and do their inner loops close?
 
-Method. n micro-springs in series, at the ranks (j - 1/2)/n, each with branches a and c of one
-spring and individual snap stresses (`recovery/cycles.py`), follow a prescribed stress with partial
-unloading and partial reloading. They should converge to the law of `foamfit.MicroscaleSpring`.
-
-Answer. Yes: the largest difference in strain falls as 1/n, and inner loops close to 1e-15:
-README.md.
+Method and answer: README.md. Also written: microscale.csv and microscale.png.
 
     python experiments/microscale/microscale.py
 """

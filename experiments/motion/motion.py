@@ -1,12 +1,8 @@
-"""How accurately is a motion recovered from a noisy displacement? Are its uncertainties right?
+"""How accurately is a motion recovered from a noisy displacement, and with what uncertainty?
 
-Method. Synthetic motions with known turning points are sampled with white noise. Motion, turning
-points and modes from `foamfit.data.motion.follow` are compared with the true motion.
+Method and answer: README.md, which 225 draws of each class (a minute) write.
 
-Answer. 95 % intervals contain the true motion at 93 to 97 % of the samples of each kind; there are
-no false turning points. README.md has the tables.
-
-    python experiments/motion/motion.py                # 225 draws a class, a minute; README.md
+    python experiments/motion/motion.py --draws 25
     python experiments/motion/motion.py --draws 4      # prints the tables only
 """
 

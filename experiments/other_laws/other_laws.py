@@ -1,19 +1,8 @@
 """How do the laws of foamfit compare with laws of the literature?
 
-Method. Running-shoe foams (arXiv:2602.12694), a mycelium, printed lattices and an impact on
-cartilage are fitted by the laws of foamfit and of this folder, each with nine parameters at most,
-by the same search, objective and intervals (`foamfit.fit`, displacement drive: the measured motion
-is prescribed, the stress compared). Then an unseen test (another specimen of the same foam, a later
-cycle of a lattice, a faster impact on the cartilage) is predicted with the fitted values: directly,
-and with the predicted stress scaled by the best factor, since specimens differ in stiffness.
-Records are thinned to at most 320 rows for all laws. The measurements are not part of this
-repository.
+Method and answer: README.md. Also written: other_laws.csv (a row per fit) and other_laws.png.
 
-Answer. Microscale springs with relaxation have the smallest misfit; Ogden-Roxburgh predicts the
-impact and the mycelium better. The script writes README.md, other_laws.csv (a row per fit) and
-other_laws.png (loops side by side).
-
-    FOAMFIT_DATA=path/to/data python experiments/other_laws/other_laws.py    # with --jobs 2 faster
+    FOAMFIT_DATA=… python experiments/other_laws/other_laws.py    # --jobs 2 is faster
 """
 
 from __future__ import annotations

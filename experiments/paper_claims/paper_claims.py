@@ -1,17 +1,8 @@
 """Are the claims of the paper correct that can be tested without its data?
 
-Question. Does the foam's own mass cause oscillation, and does a small damper remove it (1)? Is the
-literal reading, the striker's mass under its own measured stress, a valid model (2)? Do the damping
-ratios follow from the tables (3)? Do striker and loop agree in energy (4)? Can micro-springs
-produce the published branches (5)?
-
-Method. No measured curve of the paper is available: everything is simulated from the published
-parameters (Thevamaran, Fraternali & Daraio 2014, Tables 1-3). A stress drive is the base stress of
-a simulated impact, so the exact response is known.
-
-Answer. 1: yes; 2: no, the displacement error is half the peak; 3: two of three; 4: foam-1 lacks a
-fifth of the energy, foam-2 just closes its loop; 5: no. README.md has every number, each computed
-here.
+Method and answers: README.md, every number of which is computed here from the published parameters
+(Thevamaran, Fraternali & Daraio 2014, Tables 1-3). A stress drive is the base stress of a simulated
+impact, so the exact response is known.
 
     python experiments/paper_claims/paper_claims.py
 """

@@ -1,14 +1,8 @@
 """What does the plan promise on real records, and what did the further tests determine?
 
-Method. (1) A mycelium tested at 2 s per cycle (outplane-2s-1, microscale spring with relaxation):
-which rate would determine the relaxation? The plan is compared with joint fits with other specimens
-at 4 s and at 80 s per cycle (all parameters own but g1 and tau1). (2) A shoe foam (new-heel-comp-1,
-microscale spring with relaxation, softening and weakening): what would cycles 2 to 5 add to cycle
-1? The plan for five cycles of the same strain and rate is compared with the fit of cycles 1 to 5.
+Method and answer: README.md. Written: real.csv; plan.py then writes the page.
 
-Answer. What is promised is not always determined, because the law errs: README.md.
-
-    FOAMFIT_DATA=path/to/data python experiments/plan/real.py
+    FOAMFIT_DATA=… python experiments/plan/real.py
 """
 
 from __future__ import annotations

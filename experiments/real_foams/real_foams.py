@@ -1,12 +1,7 @@
 """How well do the laws fit measured foams, and do specimens of one foam get the same states?
 
-Method. Every uniaxial specimen of running-shoe foam (arXiv:2602.12694, LivingMatterLab/CANN) is
-fitted with four laws. Misfit, values and states of the specimens of one foam are compared. The
-measurements are not part of this repository; FOAMFIT_DATA contains shoe-foam/ and shoe-foam-twins/.
-
-Answer. Microscale springs with relaxation have a misfit of 0.43 to 0.93 % of the range: see
-README.md. Also written: real_foams.csv (every parameter of every fit) and real_foams.png (one loop,
-two laws).
+Method and answer: README.md. Also written: real_foams.csv (every parameter of every fit) and
+real_foams.png (one loop, two laws).
 
     FOAMFIT_DATA=… python experiments/real_foams/real_foams.py     # two minutes of processor time
 """

@@ -1,20 +1,8 @@
 """Does a fit of a real record accept what the record itself excludes?
 
-Method. Six records of real rigs, whose law, gauge or calibration is not the model's, are fitted by
-a bistable spring and by a microscale spring with one relaxation term, with the default and the
-displacement drive. The files put time and motion to zero at contact (cartilage, lattice, shoe foam)
-or begin at rest (aluminium foam). The judge reads them without foamfit. It asks of each fit: is the
-motion zero within 5 % of the motion, the stress zero within 5 % of the stress, the contact at most
-10 samples before the stress rises (leaves 1 % of its peak for good), every measured strain below 1,
-every misfit at most 100 %, the run time at most 60 s? The loops of these and other records are also
-fitted by plain least squares of the same law along the measured motion (SciPy's `least_squares`,
-25 random starts, zeros as prepared).
+Method and answer: README.md. Also written: fits.csv and loops.csv.
 
-Answer. No fit accepts what its record excludes. The loops are followed within 1.05 times plain
-least squares. On cartilage 3 the bistable spring is better than that, but a better minimum (3.8 %)
-is missed: see README.md. Also written: fits.csv and loops.csv.
-
-    FOAMFIT_DATA=path/to/data python experiments/real_records/real_records.py   # 8 minutes
+    FOAMFIT_DATA=… python experiments/real_records/real_records.py   # 8 minutes
 """
 
 from __future__ import annotations

@@ -1,15 +1,8 @@
 """Does the band of a prediction contain an unseen specimen, and is it narrow enough?
 
-Method. shoe-foam-twins/ (not part of this repository) contains compressions of five specimens each
-of a new and a worn heel (arXiv:2602.12694, LivingMatterLab/CANN on GitHub). Each specimen is
-predicted from a joint fit of the other four of its heel, all parameters "scatter", and then three
-specimens from two, most parameters "own". The band is compared with the t interval of the measured
-curves.
+Method and answer: README.md. Also written: scatter.csv.
 
-Answer. 95.2 % of the samples are inside; the band is 1.26 times as wide as the t interval. The
-study writes README.md and scatter.csv and takes about ten minutes.
-
-    FOAMFIT_DATA=path/to/data python experiments/scatter/scatter.py
+    FOAMFIT_DATA=… python experiments/scatter/scatter.py       # ten minutes
 """
 
 from __future__ import annotations

@@ -1,28 +1,7 @@
-"""Is any result of the solver wrong? Random scenes and a judge that shares no code with it.
+"""Is any result of the solver wrong? Random scenes and judges that share no code with it.
 
-Method. Each scene is solved by the solver and by brute force or root finding. Fifteen families are
-drawn at random from a seed (every scene is synthetic):
-
-- study: the ranges of scenes.py; long: 3 to 10 springs with interior masses, few dashpots;
-- base: impacts on a chain with a base dashpot and a mass above it, from 1e-7 s to several contacts;
-- gap: unilateral springs that open, with derivatives with respect to parameters;
-- turns: displacement and stress histories with random turning points;
-- microscale: one to three of them, in all three drives, with spreads from 1e-3 to 2;
-- relaxation: one to three bistable springs with one to three relaxation terms; both together;
-- mixed: two to five springs of all kinds, with and without relaxation, dashpots and masses;
-- motion: two to four springs under a known motion, at least one of them microscale, with spreads
-  from 1e-6 to 5, arbitrary time origins and steps that differ up to 1e8-fold, by root finding;
-  motion+relaxation: the same with relaxation and dashpots, by brute force;
-- worn: one to three microscale springs with stiffening, softening and weakening, in all three
-  drives; worn+relaxation; worn chain: two to five springs of all kinds, most with masses; worn
-  motion: motion and motion+relaxation alternately.
-
-A tenth of the scenes with memory request derivatives.
-
-Answer. No: every scene that can be judged is within `rtol`, and no derivative is wrong: README.md.
-
-One command runs them and writes a row per scene and rtol, those of the last four families to
-worn.csv:
+Method, families of scenes and answer: README.md. One command runs them and writes a row per scene
+and rtol, those of the last four families to worn.csv:
 
     python experiments/stability/fresh.py                 # --out writes all to another file
     python experiments/stability/fresh.py --page          # README.md of fresh.csv and worn.csv

@@ -1,15 +1,10 @@
 """How long does `foamfit fit` take to the report, warm and at first use, and where is time spent?
 
-Method. A synthetic impact (published foam-1/model-1 at 2 m/s, 1 % white noise) is fitted by
-`foamfit fit`, each time in a new process. "First use" is the first fit after installation: nothing
-is compiled (an empty NUMBA_CACHE_DIR). The parts are measured in another process, which calls the
-same functions in turn; in the last part, figures are drawn in other processes if there are two
-cores, as in the command.
+Method and answer: README.md. "First use" is the first fit after installation: nothing is compiled
+(an empty NUMBA_CACHE_DIR). The parts are measured in another process, which calls the same
+functions.
 
-Answer. 600 rows: 5.4 s after compilation, 18 s at first use; README.md lists the parts. A million
-rows: 6.2 s, 384 MiB.
-
-    python experiments/start_up/start_up.py                            # the table of README.md
+    python experiments/start_up/start_up.py
     python experiments/start_up/start_up.py --rows 1000000 --warm 1 --first 0
 """
 

@@ -1,15 +1,8 @@
 """How does wear change a running-shoe foam? Five specimens each of a new and a worn heel.
 
-Method. The measurements (arXiv:2602.12694, LivingMatterLab/CANN on GitHub; not part of this
-repository) are compressions of ten specimens, six to seven cycles each. The study works like a
-user: a TOML beside each test, `foamfit.batch` over all tests and cycles, `foamfit.joint` of the new
-and of the worn specimens. Common values are compared by Welch's test of their logarithms, with
-Holm's correction for all comparisons of a cycle.
+Method and answer: README.md. Also written: batch.csv, wear.csv and a figure.
 
-Answer. The worn heel dissipates less, but no parameter changes by more than the scatter within a
-heel. The study writes README.md, batch.csv, wear.csv and a figure.
-
-    FOAMFIT_DATA=path/to/data python experiments/twins/twins.py    # --page: from the tables alone
+    FOAMFIT_DATA=… python experiments/twins/twins.py    # --page: from the tables alone
 """
 
 from __future__ import annotations

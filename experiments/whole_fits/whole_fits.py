@@ -1,12 +1,6 @@
 """How long does a whole fit of a real record take, compared with plain least squares?
 
-Method. Real loops and an impact are fitted by `foamfit.fit` with its defaults, in one process,
-after a first fit of each kind that compiles. The unit is the time that plain SciPy needs for the
-shoe foam turbo-comp-2 with one bistable spring: sixteen random starts of `least_squares` along the
-measured motion, without any interval. It runs before and after every fit, so that both see the same
-machine.
-
-Answer. One spring 0.8 to 2, two in series 10 to 11 times as long: README.md.
+Method and answer: README.md.
 
     FOAMFIT_DATA=… python experiments/whole_fits/whole_fits.py       # 5 minutes
 """

@@ -27,6 +27,13 @@ SIZES = (1, 10, 100, 1000)
 SAMPLES = (100, 1000, 10_000, 100_000)
 
 
+def loop(samples: int, by_stress: bool) -> np.ndarray:
+    """Return a history past C1 and back: stress (Pa) or strain."""
+    spring, s = kinds.MODEL_2.bistable, np.linspace(0.0, 1.0, samples)
+    most = 1.15 * spring.sigma_hat_c if by_stress else 1.05 * spring.eps_hat_c
+    return most * np.where(s < 0.5, np.sin(np.pi * s) ** 2, np.sin(np.pi * s) ** 4)
+
+
 def kernel(chain: ff.Chain, drive: Any, time: np.ndarray) -> Any:
     """Return the bare simulation that the fit calls, as a function without arguments."""
     made = plan(chain, drive, time)
@@ -34,12 +41,15 @@ def kernel(chain: ff.Chain, drive: Any, time: np.ndarray) -> Any:
     return lambda: made.run(rows, heights, everything=False)
 
 
-@pytest.mark.parametrize("count", SIZES)
+@pytest.mark.parametrize(
+    ("count", "samples"),
+    [*((count, kinds.SAMPLES) for count in SIZES), *((1, samples) for samples in SAMPLES)],
+)
 @pytest.mark.parametrize("drive", ["stress", "displacement", "impact"])
-def test_springs(benchmark: Any, drive: str, count: int) -> None:
-    benchmark.group = f"springs, {drive}"
-    t = np.linspace(0.0, kinds.LENGTH, kinds.SAMPLES)
-    load = kinds.loop(kinds.MODEL_2.bistable, t.size, drive == "stress")
+def test_springs_and_samples(benchmark: Any, drive: str, count: int, samples: int) -> None:
+    benchmark.group = f"{drive}, {'springs' if samples == kinds.SAMPLES else 'samples'}"
+    t = np.linspace(0.0, kinds.LENGTH, samples)
+    load = loop(samples, drive == "stress")
     given = {
         "stress": ff.StressDrive(load), "displacement": ff.DisplacementDrive(kinds.HEIGHT * load),
         "impact": ff.Impact(kinds.MASS, 2.2),
@@ -47,15 +57,3 @@ def test_springs(benchmark: Any, drive: str, count: int) -> None:
     run = kernel(kinds.graded(count), given, t)
     run()
     benchmark.pedantic(run, rounds=3 if count == 1000 else 20)
-
-
-@pytest.mark.parametrize("samples", SAMPLES)
-@pytest.mark.parametrize("drive", ["stress", "impact"])
-def test_samples(benchmark: Any, drive: str, samples: int) -> None:
-    benchmark.group = f"samples, {drive}"
-    t = np.linspace(0.0, kinds.LENGTH, samples)
-    load = kinds.loop(kinds.MODEL_2.bistable, samples, True)
-    given = ff.StressDrive(load) if drive == "stress" else ff.Impact(kinds.MASS, 2.0)
-    run = kernel(ff.Chain([kinds.MODEL_2.bistable], [kinds.HEIGHT], kinds.AREA), given, t)
-    run()
-    benchmark.pedantic(run, rounds=20)

@@ -37,26 +37,3 @@ def test_a_method_lowers_the_cost_until_its_time_is_up(
     assert np.all(np.diff(costs) <= 0.0)
     assert seconds[-1] == pytest.approx(0.2, abs=0.01)
     assert costs[-1] < costs[0]
-
-
-@pytest.mark.parametrize("coordinates", list(study.COORDINATES))
-def test_the_derivatives_of_the_problem_serve_in_both_coordinates(
-    problem: Problem, coordinates: str
-) -> None:
-    space = problem.space()
-    variables = study.Variables(problem, space, coordinates)
-    params = variables.params(space.encode(problem.vector()))
-    moving = [name for name, parameter in params.items() if parameter.vary]
-    sizes = dict.fromkeys(moving, 1.0)
-    if coordinates == "si":
-        sizes = dict(zip(moving, problem.sizes(tuple(moving), problem.vector()), strict=True))
-    for column, name in zip(variables.jacobian(params).T, moving, strict=True):
-        sides = []
-        for sign in (1.0, -1.0):
-            moved = params.copy()
-            moved[name].value += sign * 1e-5 * sizes[name]
-            sides.append((moved[name].value, variables.residual(moved)))
-        (up, high), (down, low) = sides
-        expected = (high - low) / (up - down)
-        largest = max(float(np.abs(expected).max()), 1e-300)
-        np.testing.assert_allclose(column, expected, rtol=0, atol=2e-3 * largest)

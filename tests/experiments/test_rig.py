@@ -81,24 +81,17 @@ def test_gravity_and_a_gauge_on_the_specimen() -> None:
 def test_a_file_says_what_the_record_holds(tmp_path: Path) -> None:
     setup = rig.Impact(channels=("force", "displacement", "acceleration"), samples=400, before=0.4)
     made = rig.impact(setup, 5)
-    contact = made.truth["contact_time"]
-    before = made.time < contact
-    assert before.mean() == pytest.approx(0.4, abs=0.01)
-    assert np.ptp(made.clean["force"][before]) == 0.0  # the offset of the sensor
-    assert made.clean["force"][0] != 0.0
-    zero = np.interp(contact, made.time[before][-2:], made.clean["displacement"][before][-2:])
-    flown = made.rig.velocity * (contact - made.time[before][-1])
-    assert zero + flown == pytest.approx(made.truth["displacement_zero"], abs=1e-9)
-    path = rig.write(made, tmp_path)
-    header, *rows = path.read_text().splitlines()
+    header, *rows = rig.write(made, tmp_path).read_text().splitlines()
     assert header == "time (ms),force (N),displacement (mm),acceleration (m/s^2)"
     table = np.array([row.split(",") for row in rows], dtype=float)
     assert table[:, 0] == pytest.approx(1e3 * made.time, abs=1e-7)
     assert table[:, 2] == pytest.approx(1e3 * made.channels["displacement"])
-    other = made.written_so(zero=1e-3, clock=2.0, skip=30)
-    assert other.truth["contact_time"] == contact + 2.0
-    assert np.array_equal(other.channels["force"], made.channels["force"][30:])
-    assert other.truth["displacement_zero"] == made.truth["displacement_zero"] + 1e-3
+    contact = made.truth["contact_time"]
+    before = made.time < contact
+    assert before.mean() == pytest.approx(0.4, abs=0.01)
+    flown = made.rig.velocity * (contact - made.time[before][-1])
+    zero = made.clean["displacement"][before][-1] + flown
+    assert zero == pytest.approx(made.truth["displacement_zero"], abs=1e-9)
 
 
 def test_the_rig_numbers_springs_and_terms_as_the_fit_does() -> None:

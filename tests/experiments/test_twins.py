@@ -29,15 +29,6 @@ def test_a_change_is_welchs_test_of_the_logarithms() -> None:
     assert one["change_over_spread"] == pytest.approx(-gone / spread)
 
 
-def test_a_scattering_parameter_brings_the_interval_of_the_joint_fit() -> None:
-    item = {"value": 5e5, "stderr": 2e4, "scatter": 0.12, "tests": dict.fromkeys("01234")}
-    row = Group.of_joint(item).row("new")
-    half = stats.t.ppf(0.975, 4) * 0.04
-    assert row["new_lo"] == pytest.approx(5e5 * math.exp(-half))
-    assert row["new_hi"] == pytest.approx(5e5 * math.exp(half))
-    assert (row["new"], row["new_spread"]) == (pytest.approx(5e5), 0.12)
-
-
 def test_the_mean_loop_of_one_loop_is_that_loop() -> None:
     up = np.linspace(0.0, 0.5, 301)
     strain = np.concatenate([up, up[::-1][1:]])
