@@ -8,9 +8,6 @@ import pytest
 
 import fabricated
 import foamfit as ff
-from conftest import AREA, synthetic_impact, synthetic_loop
-from foamfit.data.describe import describe
-from foamfit.data.energy import audit
 from foamfit.report.readable import readable
 from foamfit.report.summary import render_report
 from foamfit.results import ParameterEstimate
@@ -71,22 +68,3 @@ def test_noise_alone_needs_no_budget() -> None:
     text = render_report(result, fabricated.no_figures())
     assert "Uncertainty budget" not in text
     assert "systematic</th>" not in text
-
-
-def test_check_says_which_deviation_would_matter() -> None:
-    def exact(test: object) -> str:
-        text = describe(test, audit(test))
-        return " ".join(text.partition("\nexact ")[2].split())
-
-    _, impact = synthetic_impact()
-    told = exact(impact)
-    assert told.startswith("The TOML states no ± of velocity, striker mass, area and height, which")
-    assert "The ± of the velocity would probably matter most" in told
-    some = replace(impact, uncertainties={"velocity": 0.01, "area": 0.01 * AREA})
-    assert exact(some).startswith("The TOML states no ± of striker mass and height")
-    _, slow = synthetic_loop()
-    assert (
-        "The ± of the area would probably matter most: 1 % of the area is 1 % of every stress"
-        in (exact(slow))
-    )
-    assert exact(replace(slow, uncertainties={"height": 1e-6, "area": 1e-8})) == ""
