@@ -44,28 +44,5 @@ def test_the_page_on_laws_shows_the_law_of_the_notebook():
     assert shown == (ROOT / "notebooks" / "bouc_wen.py").read_text(encoding="utf-8")
 
 
-# Literal translations that readers stumble over: "a name that is no UTF-8", "compiled anew".
-AVOIDED = re.compile(
-    r"(?<![Tt]here )\b(is|are) no\b(?! (longer|more|less))|that is none\b|\bso many\b|\banew\b"
-)
-SOURCES = [path for path in (ROOT / "src").rglob("*") if path.suffix in (".py", ".txt", ".html")]
-
-
-def test_phrases_that_are_not_english_stay_out():
-    lines = (
-        (path, line) for path in PAGES + SOURCES for line in path.read_text("utf-8").split("\n")
-    )
-    assert [(path.name, line) for path, line in lines if AVOIDED.search(line)] == []
-
-
-def test_the_example_of_the_readme_writes_into_a_folder_that_git_ignores():
-    """The tracked folder fits/ has the results of the published cases."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    folder = re.search(r"foamfit fit experiments/\S+\.csv --out (\S+)\n```", text)[1]
-    assert f"Open `{folder}/report.html`" in text
-    ignored = (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()
-    assert f"/{folder.split('/')[0]}/" in ignored
-
-
 def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 700

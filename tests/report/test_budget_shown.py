@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import pytest
 
 import fabricated
 import foamfit as ff
-from conftest import AREA, HEIGHT, synthetic_impact, synthetic_loop
-from foamfit.data.energy import audit, describe
 from foamfit.report.readable import readable
-from foamfit.report.studies.batch import row_of
-from foamfit.report.summary import render_report, summary_text
-from foamfit.report.tables import names_of
+from foamfit.report.summary import render_report
 from foamfit.results import ParameterEstimate
 
 NUISANCE = {
@@ -48,14 +42,6 @@ def test_a_nuisance_parameter_reads_well(name: str) -> None:
     assert "e" not in shown.with_error
 
 
-def test_in_a_batch_they_are_the_last_columns() -> None:
-    chain = fabricated.chain_result()
-    rows = [row_of("a", "a.csv", with_nuisance()), row_of("b", "b.csv", chain)]
-    names = names_of(row.parameters for row in rows)
-    assert names[-len(NUISANCE) :] == list(NUISANCE)
-    assert set(names[: -len(NUISANCE)]) == {*fabricated.result().parameters, *chain.parameters}
-
-
 def test_the_report_has_the_budget_as_table_and_picture() -> None:
     budget = fabricated.budget(area=0.02, contact_and_zero=0.01)
     one = fabricated.result()
@@ -82,63 +68,3 @@ def test_noise_alone_needs_no_budget() -> None:
     text = render_report(result, fabricated.no_figures())
     assert "Uncertainty budget" not in text
     assert "systematic</th>" not in text
-
-
-def test_check_says_which_deviation_would_matter() -> None:
-    def exact(test: object) -> str:
-        text = describe(test, audit(test))
-        return " ".join(text.partition("\nexact ")[2].split())
-
-    _, impact = synthetic_impact()
-    told = exact(impact)
-    assert told.startswith("The TOML states no ± of velocity, striker mass, area and height, which")
-    assert "The ± of the velocity would probably matter most" in told
-    some = replace(impact, uncertainties={"velocity": 0.01, "area": 0.01 * AREA})
-    assert exact(some).startswith("The TOML states no ± of striker mass and height")
-    _, slow = synthetic_loop()
-    assert (
-        "The ± of the area would probably matter most: 1 % of the area is 1 % of every stress"
-        in (exact(slow))
-    )
-    assert exact(replace(slow, uncertainties={"height": 1e-6, "area": 1e-8})) == ""
-
-
-def impact_file(folder: Path, velocity: str, more: str = "") -> Path:
-    """Write an impact with 80 rows of free flight before contact."""
-    spring, _ = synthetic_impact()
-    contact = np.linspace(0.0, 0.75e-3, 401)
-    chain = ff.Chain([spring], [HEIGHT], AREA)
-    response = ff.simulate(chain, ff.Impact(7e-3, 2.0), contact)
-    step = contact[1]
-    before = step * np.arange(-80, 0)
-    stress = np.append(np.zeros(80), response.base_stress)
-    motion = np.append(2.0 * before, response.displacement[-1])
-    rng = np.random.default_rng(0)
-    stress += 2e-3 * np.ptp(stress) * rng.standard_normal(stress.size)
-    motion += 5e-4 * np.ptp(motion) * rng.standard_normal(motion.size)
-    table = np.column_stack(
-        [1e3 * (np.append(before, contact) + 1e-3), stress * AREA, 1e3 * motion]
-    )
-    path = folder / "impact.csv"
-    header = "time (ms),force (N),displacement (mm)"
-    np.savetxt(path, table, "%.9g", ",", header=header, comments="")
-    path.with_suffix(".toml").write_text(
-        f'[specimen]\nheight = "{HEIGHT * 1e3} mm"\narea = "{AREA * 1e6} mm^2"\n{more}'
-        f'[striker]\nmass = "7 g"\nvelocity = "{velocity}"\n'
-    )
-    return path
-
-
-def test_a_velocity_that_the_flight_contradicts_is_a_warning(tmp_path: Path) -> None:
-    right, wrong = (
-        ff.fit(ff.read_test(impact_file(tmp_path, v)), starts=2, intervals="local")
-        for v in ("2 m/s", "1.9 m/s")
-    )  # fmt: skip
-    assert not any("velocity" in warning for warning in right.warnings)
-    (told,) = [warning for warning in wrong.warnings if "velocity is given" in warning]
-    assert "moves at 2" in told
-    assert "given as 1.9 m/s" in told
-    assert wrong.status == "warnings"
-    assert summary_text(wrong, verbose=True).count("given as 1.9 m/s") == 1
-    page = render_report(wrong, fabricated.no_figures())
-    assert page.index("given as 1.9 m/s") < page.index('class="fold"')  # visible without unfolding

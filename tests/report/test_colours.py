@@ -7,16 +7,13 @@ CIE76 distances in L*a*b* (D65).
 
 from __future__ import annotations
 
-import re
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-import foamfit.report
 from drawn import figures
 from foamfit.report.figures import BLUE, FITTED, SEEN
 
@@ -103,35 +100,3 @@ def test_series_of_a_panel_are_told_apart_by_colour_or_shape() -> None:
 )
 def test_measured_and_simulated_are_told_apart(one: str, other: str) -> None:
     assert not is_told(one, other)
-
-
-TEMPLATES = Path(foamfit.report.__file__).parent / "templates"
-
-
-def backgrounds(template: str) -> dict[str, tuple[str, str]]:
-    """Return the background and text colour of each state on a page."""
-    style = (TEMPLATES / template).read_text(encoding="utf-8")
-    rule = r"([^{}\n]*)\{[^{}]*background: (#\w+); color: (#\w+);[^{}]*\}"
-    return {
-        name: (back, letters)
-        for names, back, letters in re.findall(rule, style)
-        for name in re.findall(r"\.([\w-]+)(?:,|\s*$)", names.strip() + " ")
-    }
-
-
-@pytest.mark.parametrize(
-    ("template", "states"),
-    [
-        ("base.html", ("determined", "weak", "not-determined")),
-        ("base.html", ("ok", "warnings", "failed")),
-    ],
-)
-def test_states_on_the_pages_are_told_apart_and_can_be_read(
-    template: str, states: tuple[str, ...]
-) -> None:
-    found = backgrounds(template)
-    for one, other in combinations(states, 2):
-        assert not is_told(found[one][0], found[other][0]), (one, other)
-    for back, letters in (found[state] for state in states):
-        for eye in EYES:
-            assert abs(lab(back, eye)[0] - lab(letters, eye)[0]) > 50.0

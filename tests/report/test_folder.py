@@ -92,23 +92,6 @@ def test_no_number_in_the_json_is_other_than_finite() -> None:
     assert content["energy"] == {"lost_J": [1.0, None]}
 
 
-def test_parameters_csv(saved: Path) -> None:
-    table = {row["name"]: row for row in rows(saved / "parameters.csv")}
-    assert float(table["s1_k0"]["ci95_low"]) == 5370640.0
-    assert table["s1_kh_minus"]["stderr"] == table["s1_kh_minus"]["ci95_high"] == ""
-    assert table["s1_kh_minus"]["state"] == "not determined"
-
-
-def test_curves_csv_gives_the_curves_back(saved: Path) -> None:
-    table = rows(saved / "curves.csv")
-    curves = fabricated.result().curves
-    assert list(table[0]) == [
-        "time (s)", "measured stress (Pa)", "fitted stress (Pa)", "measured displacement (m)",
-        "fitted displacement (m)", "stress along measured displacement (Pa)",
-    ]  # fmt: skip
-    assert [float(row["measured stress (Pa)"]) for row in table] == list(curves.measured_stress)
-
-
 @pytest.mark.usefixtures("no_figures")
 def test_masses_inside_have_their_columns(tmp_path: Path) -> None:
     result = fabricated.result()
@@ -119,17 +102,6 @@ def test_masses_inside_have_their_columns(tmp_path: Path) -> None:
     assert list(table[0])[-2:] == names
     assert [float(row[names[1]]) for row in table] == inside.tolist()
     assert float(table[0][names[0]]) == 1e-6
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_curve_that_is_not_there_has_no_column(tmp_path: Path) -> None:
-    result = fabricated.result()
-    result = replace(result, curves=replace(result.curves, time=None, displacement=None))
-    table = rows(result.save(tmp_path / "r") / "curves.csv")
-    assert list(table[0]) == [
-        "measured stress (Pa)", "fitted stress (Pa)", "measured displacement (m)",
-        "stress along measured displacement (Pa)",
-    ]  # fmt: skip
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -163,25 +135,6 @@ def test_failing_midway_leaves_the_older_result(
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_failing_at_the_swap_puts_the_older_result_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = fabricated.result(seed=1).save(tmp_path / "r")
-    swap = Path.replace
-
-    def fail_for_the_new(self: Path, target: Path) -> Path:
-        if self.name.endswith(".new"):
-            raise OSError(28, "No space left on device")
-        return swap(self, target)
-
-    monkeypatch.setattr(Path, "replace", fail_for_the_new)
-    with pytest.raises(InputError, match="No space left on device"):
-        fabricated.result(seed=2).save(folder)
-    assert load_result(folder)["seed"] == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["r"]
-
-
-@pytest.mark.usefixtures("no_figures")
 def test_a_folder_of_something_else_is_refused_and_kept(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("all of it")
     with pytest.raises(InputError, match="not empty"):
@@ -189,13 +142,6 @@ def test_a_folder_of_something_else_is_refused_and_kept(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is a file"):
         check_target(tmp_path / "thesis.tex")
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
-
-
-def test_an_output_that_cannot_be_written_is_an_input_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match="cannot be written"):
-        fabricated.result().save(tmp_path / "file" / "r")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 @pytest.mark.parametrize(

@@ -176,7 +176,7 @@ def test_files_and_terminal(soft, tmp_path, monkeypatch):
     assert striker["velocity"] == f"{advice['velocity']:.6g} m/s"
     page = (folder / "plan.html").read_text(encoding="utf-8")
     assert "which test next?" in page
-    assert 'src="data:image/png' in page
+    assert 'src="data:image/svg+xml' in page
     # Once the new record is there, one line fits both.
     record = FOAM_1 / "model-2-2.0mps-reconstruction.csv"
     (folder / "next.csv").write_bytes(record.read_bytes())

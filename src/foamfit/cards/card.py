@@ -147,19 +147,14 @@ class Card:
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of FILE.json; curves in SI, engineering, compression positive."""
         c = self.curves
-        content: dict[str, Any] = plain(
-            {
-                "format": self.format,
-                "misfit": self.misfit,
-                "parameters": self.unloading._asdict(),
-                "curves": [
-                    {"rate": rate, "strain": c.strain, "stress": one, "measured_to": c.measured_to}
-                    for rate, one in zip(c.rates, c.stress, strict=True)
-                ],
-                "warnings": self.warnings,
-            }
-        )
-        return content
+        curves = [
+            {"rate": rate, "strain": c.strain, "stress": one, "measured_to": c.measured_to}
+            for rate, one in zip(c.rates, c.stress, strict=True)
+        ]
+        parameters = self.unloading._asdict()
+        content: dict[str, Any] = {"format": self.format, "misfit": self.misfit}
+        content |= {"parameters": parameters, "curves": curves, "warnings": self.warnings}
+        return dict(plain(content))
 
     @property
     def text(self) -> str:
@@ -211,9 +206,8 @@ class Card:
         for one in files:
             check_file(one)
         figure = draw(self)
-        pictures = (image(figure, "png"), image(figure, "pdf"))
         text = json.dumps(self.to_json_dict(), indent=2, allow_nan=False) + "\n"
-        contents = (self.text.encode(), text.encode(), *pictures)
+        contents = (self.text.encode(), text.encode(), image(figure, "png"), image(figure, "pdf"))
         for done, (one, content) in enumerate(zip(files, contents, strict=True)):
             try:
                 write_file(one, content)

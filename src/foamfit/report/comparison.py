@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from uncertainties import correlated_values_norm, nominal_value, std_dev
+from uncertainties import correlated_values_norm, nominal_value, std_dev, ufloat
 
 from foamfit.codec import build, reading
 from foamfit.errors import InputError
@@ -47,15 +47,13 @@ VAGUE = "its standard error is many times its value, so the test does not determ
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity and its reference, in the paper's unit ("k_h+/k0", "" or "k0", "MPa").
+    """One quantity and its reference, in the paper's unit ("s2 k_h+/k0", "" or "k0", "MPa").
 
-    `spring` is 1 at the base and 0 for quantities of the chain. The state of a ratio is the worst
-    of its parts. A published `reference` has no standard error. `remark` is the reason why value
-    and reference are not compared, or "".
+    The state of a ratio is the worst of its parts. A published `reference` has no standard error.
+    `remark` is the reason why value and reference are not compared, or "".
     """
 
-    spring: int
-    name: str
+    label: str
     unit: str
     value: float
     stderr: float | None
@@ -63,11 +61,6 @@ class Row:
     reference: float | None
     reference_stderr: float | None
     remark: str
-
-    @property
-    def label(self) -> str:
-        """The name with the spring, for example "s2 k0"."""
-        return f"s{self.spring} {self.name}" if self.spring else self.name
 
     @property
     def lost(self) -> bool:
@@ -217,14 +210,16 @@ def _with_errors(
     estimates: Mapping[str, ParameterEstimate], names: Sequence[str], matrix: Sequence[Any]
 ) -> dict[str, Any]:
     """Return values with correlated errors; parameters missing in the matrix are independent."""
-    every = list(estimates)
-    correlation, at = np.eye(len(every)), [every.index(name) for name in names if name in every]
-    if names:
-        keep = [i for i, name in enumerate(names) if name in every]
-        known = np.array(matrix, dtype=float)[np.ix_(keep, keep)]
-        correlation[np.ix_(at, at)] = np.where(np.isnan(known), np.eye(len(keep)), known)
-    pairs = [(p.value, p.stderr or 0.0) for p in estimates.values()]
-    return dict(zip(every, correlated_values_norm(pairs, correlation), strict=True))
+    errors = {name: p.stderr for name, p in estimates.items() if p.stderr}
+    numbers: dict[str, Any] = {name: p.value for name, p in estimates.items()}
+    numbers |= {name: ufloat(numbers[name], error) for name, error in errors.items()}
+    if kept := [i for i, name in enumerate(names) if name in errors]:
+        known = np.array(matrix, dtype=float)[np.ix_(kept, kept)]
+        known = np.where(np.isnan(known), np.eye(len(kept)), known)
+        shared = [names[i] for i in kept]
+        pairs = [(numbers[name].n, numbers[name].s) for name in shared]
+        numbers |= zip(shared, correlated_values_norm(pairs, known), strict=True)
+    return numbers
 
 
 def published_side(name: str) -> Side:
@@ -252,7 +247,7 @@ def _pair(side: Side, other: Side) -> Pair:
     about: dict[str, Any] = {"side": side, "other": other}
     nothing = words("incomparable", **about)
     rows = (*_spring_rows(side, other, nothing), *_damping_rows(side, other, nothing))
-    ratios = any("/" in row.name for row in rows)
+    ratios = any("/" in row.label for row in rows)
     return Pair(side, other, rows, sentences("remarks", nothing=nothing, ratios=ratios, **about))
 
 
@@ -274,21 +269,22 @@ def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
 
 
 def _row(
-    at: tuple[int, str, str],
+    label: str,
+    unit: str,
     value: ParameterEstimate,
     reference: ParameterEstimate | None,
     about: tuple[Side, Side, str],
     *,
     eta: bool = False,
 ) -> Row:
-    """Return a row; `at` is spring, name and unit, `about` both sides and why none is compared."""
+    """Return a row; `about` are both sides and why nothing is compared, or ""."""
     side, other, nothing = about
     size = max(abs(value.value), abs(reference.value) if reference else 0.0)
     vague = reference is not None and (value.stderr or 0.0) > NOTHING * size
     known: dict[str, Any] = {"value": value, "reference": reference, "side": side, "other": other}
     remark = nothing or words("remark", eta=eta, vague=VAGUE if vague else "", **known)
     theirs, error = (reference.value, reference.stderr) if reference else (None, None)
-    return Row(*at, value.value, value.stderr, value.state, theirs, error, remark)
+    return Row(label, unit, value.value, value.stderr, value.state, theirs, error, remark)
 
 
 def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
@@ -305,8 +301,8 @@ def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
             if value is None or (eta and not several):
                 continue
             if not (eta and reference is None and (value.state, value.value) == ("fixed", 0.0)):
-                at = (i if several else 0, one.label, one.unit)
-                yield _row(at, value, reference, (side, other, nothing), eta=eta)
+                label = f"s{i} {one.label}" if several else one.label
+                yield _row(label, one.unit, value, reference, (side, other, nothing), eta=eta)
 
 
 def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
@@ -319,8 +315,8 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
         return
     if item is None and value.value == 0.0 and not (reference and reference.value):
         return
-    at = (0, "site η" if len(kinds) > 1 else "η", "Pa·s")
-    damping = _row(at, value, reference, (side, other, nothing), eta=True)
+    label = "site η" if len(kinds) > 1 else "η"
+    damping = _row(label, "Pa·s", value, reference, (side, other, nothing), eta=True)
     yield damping
     soft = [i for i, kind in enumerate(kinds, 1) if law(kind).hysteretic]
     if item is None or len(soft) != 1 or nothing:
@@ -335,7 +331,7 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
         # ζ is η over a square root, so it has the state of η unless k_c is undetermined.
         unknown = ratio.state == "not determined" and value.state != "fixed"
         state, remark = ratio.state if unknown else value.state, damping.remark
-        yield Row(0, "ζ", "", ratio.value, ratio.stderr, state, item.damping_ratio, None, remark)
+        yield Row("ζ", "", ratio.value, ratio.stderr, state, item.damping_ratio, None, remark)
 
 
 # ---------------------------------------------------------------- text and figure

@@ -98,10 +98,9 @@ class _Labels:
         self.drawn += [places, places]
 
     def write(
-        self, name: str, places: Sequence[Array], *, below: bool = False, **style: Any
+        self, name: str, places: Sequence[Array], sides: Sequence[Any] = SIDES, **style: Any
     ) -> None:
         """Write a name near one of `places`, where it covers least; earlier ones are preferred."""
-        sides = (*SIDES[1:], SIDES[0]) if below else SIDES
         avoid = (np.concatenate(self.drawn) - self.corner) * self.scale
         size, candidates = np.array([4.2 * len(name), 9.0]), []
         for rank, (place, far, (dx, dy)) in enumerate(product(places, FARTHER, sides)):
@@ -111,7 +110,7 @@ class _Labels:
             names = sum(bool(np.all((low < b[2:]) & (b[:2] < high))) for b in self.taken)
             beyond = bool(np.any((low < 0.0) | (high > self.size)))
             inside = int(np.all((avoid > low) & (avoid < high), axis=1).sum())
-            cost = 1000 * names + 50 * beyond + inside + 0.5 * rank
+            cost = 1000 * names + 100 * beyond + inside + 0.5 * rank
             candidates.append((cost, place, (dx, dy), np.concatenate((low, high))))
         _, at, offset, box = min(candidates, key=lambda one: one[0])
         self.taken.append(box)
@@ -188,8 +187,8 @@ def _name_branches(labels: _Labels, panel: Panel, result: Fit) -> None:
         middle = x[evenly(x, y, 3)[1]]
         inner = np.column_stack((x, y))[evenly(x, y, 9)]
         around = sorted(inner, key=lambda at: float(abs(at[0] - middle)))
-        style: Any = {"below": x[-1] < x[0], "color": BLUE, "fontsize": 7.0}
-        labels.write(branch, around[:3], label="_on branch", **style)
+        side = SIDES[1:2] if x[-1] < x[0] else SIDES[:1]  # below the curve on the way back
+        labels.write(branch, around, side, color=BLUE, fontsize=7.0, label="_on branch")
 
 
 def _longest_visits(result: Fit, fitted: Line) -> dict[str, slice]:
