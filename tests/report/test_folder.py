@@ -94,8 +94,8 @@ def test_no_number_in_the_json_is_other_than_finite() -> None:
 
 def test_parameters_csv(saved: Path) -> None:
     table = {row["name"]: row for row in rows(saved / "parameters.csv")}
-    assert float(table["s1_k0"]["ci95_low"]) == 5370640.0
-    assert table["s1_kh_minus"]["stderr"] == table["s1_kh_minus"]["ci95_high"] == ""
+    assert float(table["s1_k0"]["ci95_lo"]) == 5370640.0
+    assert table["s1_kh_minus"]["stderr"] == table["s1_kh_minus"]["ci95_hi"] == ""
     assert table["s1_kh_minus"]["state"] == "not determined"
 
 
