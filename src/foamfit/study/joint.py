@@ -19,6 +19,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, naming
 from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.links import KINDS, RATES, Links
+from foamfit.fitting.objective import Spent
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params
 from foamfit.fitting.search import Tracker, descend
 from foamfit.fitting.together import Together
@@ -291,8 +292,9 @@ class _Own(NamedTuple):
     @classmethod
     def of(cls, problem: Problem, tracker: Tracker, values: Array) -> _Own:
         """Return the result of a search or a descent; the joint fit counts its own evaluations."""
-        cost = tracker.best_cost / problem.objective.n_data
-        return cls(replace(problem, objective=replace(problem.objective)), values, cost)
+        objective = replace(problem.objective, spent=Spent())
+        cost = tracker.best_cost / objective.n_data
+        return cls(replace(problem, objective=objective), values, cost)
 
 
 def _own_fit(
