@@ -103,6 +103,12 @@ def compiled() -> Iterator[None]:
     yield
 
 
+def write_csv(path: Path, head: str, *columns: Any, fmt: str = "%.9g") -> Path:
+    """Write columns under a head."""
+    np.savetxt(path, np.column_stack(columns), fmt, ",", header=head, comments="")
+    return path
+
+
 def thinned(path: Path, folder: Path, every: int) -> Path:
     """Write every n-th row of a record into a folder (n is `every`)."""
     head, *rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
@@ -152,19 +158,12 @@ def synthetic_impact(
     rng = np.random.default_rng(seed)
     stress, motion = response.base_stress, response.displacement[-1]
     spread = [noise * np.ptp(stress), noise * np.ptp(motion)]
-    measurement = Measurement(
-        name="synthetic impact",
-        path=None,
-        data_sha256="0" * 64,
-        time=time,
-        stress=stress + spread[0] * rng.standard_normal(samples),
-        displacement=motion + spread[1] * rng.standard_normal(samples),
-        specimen=Specimen(HEIGHT, AREA),
-        striker=Striker(7e-3, velocity),
-        noise=Noise(*spread) if noise else Noise(),
-        motion="measured",
-    )
-    return spring, measurement
+    stress = stress + spread[0] * rng.standard_normal(samples)
+    motion = motion + spread[1] * rng.standard_normal(samples)
+    return spring, Measurement(
+        "synthetic impact", None, "0" * 64, time, stress, motion, Specimen(HEIGHT, AREA),
+        Striker(7e-3, velocity), Noise(*spread) if noise else Noise(), motion="measured",
+    )  # fmt: skip
 
 
 def refused(path: Path, *words: str, specimen: Path | None = None) -> None:
@@ -193,12 +192,5 @@ def loop_measurement(
 ) -> Measurement:
     """Return a measured loop of stress (Pa) and displacement (m), with or without time (s)."""
     return Measurement(
-        name="synthetic loop",
-        path=None,
-        data_sha256="",
-        time=time,
-        stress=stress,
-        displacement=motion,
-        specimen=specimen,
-        motion="measured",
+        "synthetic loop", None, "", time, stress, motion, specimen, motion="measured"
     )

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 import foamfit as ff
+from conftest import write_csv
 
 HEIGHT, AREA = 10e-3, 1e-4
 FRESH = ff.BistableSpring(
@@ -28,13 +29,9 @@ def write_record(folder: Path) -> Path:
         stress.append(np.where(one > gone, np.maximum(pressed, 0.0), 0.0))
     strain, stress = (np.concatenate([*parts, [0.0]]) for parts in (strain, stress))
     stress = stress + 500.0 * np.random.default_rng(0).standard_normal(stress.size)
-    path = folder / "synthetic.csv"
-    lines = ["time (s),stress (MPa),displacement (mm)"]
-    lines += [
-        f"{0.01 * i:.2f},{1e-6 * s:.6f},{1e3 * HEIGHT * e:.6f}"
-        for i, (e, s) in enumerate(zip(strain, stress, strict=True))
-    ]
-    path.write_text("\n".join(lines) + "\n")
+    columns = 0.01 * np.arange(strain.size), 1e-6 * stress, 1e3 * HEIGHT * strain
+    path, head = folder / "synthetic.csv", "time (s),stress (MPa),displacement (mm)"
+    write_csv(path, head, *columns, fmt="%.6f")
     toml = f'[specimen]\nheight = "{1e3 * HEIGHT} mm"\narea = "{1e6 * AREA} mm^2"\n'
     path.with_suffix(".toml").write_text(toml)
     return path

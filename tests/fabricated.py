@@ -38,39 +38,27 @@ UNITS = {
 }
 
 
-def half_sine(
-    spring: BistableSpring = SPRING, top: float = 0.35, n: int = 601
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[Switch, ...]]:
-    """Return time (s), strain, stress (Pa) and switches of one loading to `top` and unloading."""
-    time = np.linspace(0.0, 0.9e-3, n)
-    strain = top * np.sin(np.pi * time / time[-1])
-    stress, flag, branch, switches = np.empty(n), "a", "a", []
-    for i, eps in enumerate(strain):
-        before = branch
-        flag, branch = _branch(spring, flag, eps)
-        stress[i] = _stress(spring, branch, eps)
-        if branch != before:
-            switches.append(Switch(1, before, branch, time[i], eps * HEIGHT, stress[i]))
-    return time, strain, stress, tuple(switches)
-
-
-def _branch(s: BistableSpring, flag: str, eps: float) -> tuple[str, str]:
-    if flag == "a":
-        if eps > s.eps_hat_c:
-            return "c", "c"
-        return "a", "d" if eps > s.eps_a else "a"
-    if eps < (s.eps_hat_a or 0.0):
-        return "a", "a"
-    return "c", "c" if eps > s.eps_c else "e"
-
-
-def _stress(s: BistableSpring, branch: str, eps: float) -> float:
-    return {
-        "a": s.k0 * eps / (1 - eps),
-        "d": s.sigma_a + s.kh_plus * (eps - s.eps_a),
-        "c": s.kc * (eps - s.eps_star) / (1 - eps + s.eps_star),
-        "e": s.sigma_c + s.kh_minus * (eps - s.eps_c),
-    }[branch]
+def half_sine() -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[Switch, ...]]:
+    """Return time (s), strain, stress (Pa) and switches of one loading to 35 % and unloading."""
+    time = np.linspace(0.0, 0.9e-3, 601)
+    strain = 0.35 * np.sin(np.pi * time / time[-1])
+    stress, back = np.asarray(SPRING.stress(strain)), time > time[300]
+    begins = {
+        ("a", "d"): strain > SPRING.eps_a,
+        ("d", "c"): strain > SPRING.eps_hat_c,
+        ("c", "e"): back & (strain <= SPRING.eps_c),
+        ("e", "a"): back & (strain < SPRING.eps_hat_a),
+    }
+    places = {branches: int(np.argmax(found)) for branches, found in begins.items()}
+    return (
+        time,
+        strain,
+        stress,
+        tuple(
+            Switch(1, *branches, time[i], strain[i] * HEIGHT, stress[i])
+            for branches, i in places.items()
+        ),
+    )
 
 
 def estimate(name: str, value: float, **changed: Any) -> ParameterEstimate:

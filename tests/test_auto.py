@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,15 +14,13 @@ import pytest
 from click.testing import CliRunner
 from scipy.signal import lfilter
 
-import fabricated
 import foamfit as ff
-from conftest import needs_data, small_pictures, synthetic_impact, synthetic_loop
+from conftest import needs_data, small_pictures, synthetic_impact, synthetic_loop, write_csv
 from foamfit import auto, one_model
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers, Specimen, Striker
 from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.problem import make_problem
-from foamfit.report.summary import render_report, summary_text
 from foamfit.springs import laws
 from foamfit.springs.model import Model
 from foamfit.trust import evidence
@@ -166,29 +165,22 @@ def test_a_bent_structure_is_found_where_it_is():
 # ---------------------------------------------------------------- known structures
 
 
-def impact(springs, heights, site=0.0, velocity=2.0, noise=0.005, seed=0, samples=101):
-    """Simulate an impact whose noise level is not stated."""
-    chain = ff.Chain(springs, heights, AREA, site_damping=site)
+def impact(springs, heights, velocity, samples=101):
+    """Simulate an impact with noise of 0.5 %, whose level is not stated."""
+    chain = ff.Chain(springs, heights, AREA)
     drive = ff.Impact(7e-3, velocity)
     long = ff.simulate(chain, drive, np.linspace(0, 20 * HEIGHT / velocity, 4001))
     time = np.linspace(0, 1.05 * long.contact_end, samples)
     run = ff.simulate(chain, drive, time)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     curves = [
-        y + noise * np.ptp(y) * rng.standard_normal(y.size)
+        y + 0.005 * np.ptp(y) * rng.standard_normal(y.size)
         for y in (run.base_stress, run.displacement[-1])
     ]
     return Measurement(
-        name="synthetic impact",
-        path=None,
-        data_sha256="",
-        time=time,
-        stress=curves[0],
-        displacement=curves[1],
-        specimen=Specimen(HEIGHT, AREA),
-        striker=Striker(7e-3, velocity),
-        motion="measured",
-    )
+        "synthetic impact", None, "", time, *curves, Specimen(HEIGHT, AREA),
+        Striker(7e-3, velocity), motion="measured",
+    )  # fmt: skip
 
 
 SPRING = ff.published["foam-1/model-1"].bistable
@@ -198,22 +190,16 @@ SOFT = ff.BistableSpring(
 STIFF = ff.BistableSpring(
     k0=15e6, kc=200e6, dsigma=-1.2e6, eps_a=0.2, eps_c=0.5, kh_plus=15e6, kh_minus=4e6
 )
-LINE = ff.LinearSpring(12e6)
 HALVES = [0.5 * HEIGHT] * 2
 CASES = {
-    "bistable without damping": ([SPRING], [HEIGHT], 0.0),
-    "bistable with damping": ([replace(SPRING, eta=400.0)], [HEIGHT], 0.0),
-    "linear+bistable without damping": ([LINE, SOFT], HALVES, 0.0),
-    "linear+bistable with damping": ([LINE, SOFT], HALVES, 400.0),
+    "bistable with damping": ([replace(SPRING, eta=400.0)], [HEIGHT]),
+    "linear+bistable without damping": ([ff.LinearSpring(12e6), SOFT], HALVES),
 }
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_clear_structure_is_found(name, monkeypatch):
-    springs, heights, site = CASES[name]
-    if name == "linear+bistable with damping":  # saves time; the other cases use the full ladder
-        monkeypatch.setattr(auto, "LADDER", groups("bistable", "linear+bistable"))
-    test = impact(springs, heights, site, velocity=2.6)
+def test_a_clear_structure_is_found(name):
+    test = impact(*CASES[name], velocity=2.6)
     result = ff.fit(test, model="auto", starts=2, intervals="local")
     assert result.ladder.chosen.name == name
     assert result.model == result.ladder.chosen.model
@@ -298,7 +284,7 @@ def test_no_model_twice_as_bad_with_no_fewer_parameters_is_chosen():
             assert not any(n <= varied and 2.0 * off < misfit for n, off, _ in table)
 
 
-def slow_loop(*, noise=0.003, wave=0.0, seed=0, samples=150):
+def slow_loop(*, noise=0.003, wave=0.0, samples=150):
     """Simulate a 2 s loop with time on a relaxing microscale spring, plus a wave no model follows.
 
     Noise and wave amplitude are fractions of the stress range.
@@ -311,18 +297,12 @@ def slow_loop(*, noise=0.003, wave=0.0, seed=0, samples=150):
     strain = 0.5 * np.interp(time, [0.0, 1.0, 2.0], [0.0, 1.0, 0.02])
     drive = ff.DisplacementDrive(strain * HEIGHT)
     stress = ff.simulate(ff.Chain([spring], [HEIGHT], AREA), drive, time).base_stress
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     off = noise * rng.standard_normal(time.size) + wave * np.sin(20.0 * time)
     return Measurement(
-        name="slow loop",
-        path=None,
-        data_sha256="",
-        time=time,
-        stress=stress + np.ptp(stress) * off,
-        displacement=strain * HEIGHT,
-        specimen=Specimen(HEIGHT, AREA),
-        motion="measured",
-    )
+        "slow loop", None, "", time, stress + np.ptp(stress) * off, strain * HEIGHT,
+        Specimen(HEIGHT, AREA), motion="measured",
+    )  # fmt: skip
 
 
 def test_held_back_samples_are_predicted_by_a_fit_to_the_others():
@@ -349,12 +329,9 @@ def test_a_microscale_spring_that_relaxes_is_found():
     assert chosen.gain > 0.5
 
 
-def test_where_no_model_reaches_the_noise_prediction_decides(monkeypatch):
-    monkeypatch.setattr(
-        auto,
-        "LADDER",
-        (*groups("bistable", "microscale"), *groups("microscale", relaxation=1)),
-    )
+def test_where_no_model_reaches_the_noise_prediction_decides(monkeypatch, tmp_path):
+    few = (*groups("bistable", "microscale"), *groups("microscale", relaxation=1))
+    monkeypatch.setattr(auto, "LADDER", few)
     result = ff.fit(slow_loop(wave=0.005), model="auto", starts=2, intervals="local")
     ladder = result.ladder
     assert ladder.by_prediction
@@ -362,7 +339,15 @@ def test_where_no_model_reaches_the_noise_prediction_decides(monkeypatch):
     assert len(ladder.rungs) == 3
     for rung in ladder.rungs:
         assert rung.predicted_misfit >= 0.98 * rung.misfit["stress_strain"]
-    content = result.to_json_dict()["ladder"]
+    small_pictures(monkeypatch)
+    folder = result.save(tmp_path / "auto")
+    content = json.loads((folder / "fit.json").read_text())["ladder"]
+    with (folder / "ladder.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for one, rung in zip(rows, content["rungs"], strict=True):
+        assert (one["model"], float(one["bic"])) == (rung["model"], rung["bic"])
+        assert float(one["misfit_stress_strain"]) == rung["misfit"]["stress_strain"]
+        assert one["why"] == rung["why"] != ""
     row = content["rungs"][2]
     assert (row["model"], row["relaxation"]) == ("microscale", 1)
     simpler = min(content["rungs"][:2], key=lambda rung: rung["predicted_misfit"])
@@ -371,17 +356,6 @@ def test_where_no_model_reaches_the_noise_prediction_decides(monkeypatch):
     assert f"{100 * row['gain']:.0f} % less than {simpler['model']};" in ladder.chosen.why
     assert any("AICc and BIC are not valid" in sentence for sentence in ladder.sentences)
     assert any(text.startswith("Every model leaves system") for text in result.warnings)
-
-
-@pytest.mark.parametrize("given", [None, 0.004])
-def test_without_the_time_for_a_prediction_the_fitted_misfit_stands_in(given):
-    """If one model has no prediction, the fitted misfit is used for all models."""
-    models = [
-        SimpleNamespace(varied=7, misfit=0.02, predicted=0.05),
-        SimpleNamespace(varied=9, misfit=0.003, predicted=given),
-    ]
-    scores = evidence.scores_of(models)
-    assert [one.predicted for one in scores] == ([0.02, 0.003] if given is None else [0.05, 0.004])
 
 
 @needs_data
@@ -394,26 +368,6 @@ def test_a_running_shoe_foam_ends_below_one_percent(thin_foams, tmp_path, monkey
     result = ff.fit(test, model="auto", starts=2, intervals="local")
     assert result.misfit["stress_strain"] <= 0.009
     assert result.ladder.chosen.name == "microscale with relaxation"
-
-
-def test_a_simpler_model_is_carried_into_its_relaxation():
-    """With a relaxing fraction of zero, the curves are those of the simpler model."""
-    test = slow_loop()
-    simple = ff.fit(test, model="microscale", starts=2, intervals="local")
-    problem = make_problem(test, "microscale", None, None, None, False, relaxation=1)
-    tried = [SimpleNamespace(result=simple, chisqr=1.0)]
-    auto._carry(problem.params, problem.model, tried)
-    assert problem.params["s1_g1"].value == 0.0
-    there = problem.objective.simulate(problem.vector()).curves["stress_strain"]
-    assert there == pytest.approx(simple.curves.stress_along, rel=1e-9)
-
-
-def test_relaxation_belongs_to_one_model(loop_file):
-    with pytest.raises(ff.InputError, match="relaxation = 1 belongs to one model"):
-        ff.fit(synthetic_loop()[1], model="auto", relaxation=1)
-    done = run("fit", loop_file, "--model", "auto", "--relaxation", 2)
-    assert (done.exit_code, done.stdout) == (1, "")
-    assert "relaxation = 2 belongs to one model" in done.stderr
 
 
 # --------------------------------------------------------------- which models
@@ -452,29 +406,6 @@ def test_only_models_that_the_test_allows_are_tried(monkeypatch):
     assert skipped[0] == "bistable with relaxation: relaxation needs a time column"
     with pytest.raises(ff.InputError, match="no model of the ladder"):
         ff.fit(replace(test, interior={5: test.displacement}), model="auto")
-
-
-@pytest.mark.parametrize(("microscale", "tried"), [(0.021, True), (0.023, False)])
-def test_chains_of_microscale_springs_need_one_that_follows_the_curves(microscale, tried):
-    """One microscale spring must follow the curves nearly as well as one bistable spring."""
-    misfits = {("bistable", 0): 0.02, ("microscale", 0): microscale, ("microscale", 1): 0.001}
-    before = [
-        SimpleNamespace(result=SimpleNamespace(model=model, relaxation=terms), misfit=misfit)
-        for (model, terms), misfit in misfits.items()
-    ]
-    why = auto._hopeless(Model.parse("linear+microscale"), before)
-    assert why == (
-        ""
-        if tried
-        else "one microscale spring misses the curves by 2.3 % of the range, "
-        "one bistable spring misses the curves by 2 % of the range"
-    )
-    for model in (Model.parse("linear+bistable"), Model.parse("microscale", 1)):
-        assert auto._hopeless(model, before) == ""
-    remembers = Model.parse("microscale, stiffening, mullins", 1)
-    assert auto._hopeless(remembers, before) == ""  # relaxing microscale misses by 0.1 %
-    assert bool(auto._hopeless(remembers, before[:2]))
-    assert auto._hopeless(Model.parse("linear+microscale"), before[1:]) == ""
 
 
 def test_springs_in_series_are_not_searched_on_from_a_poor_first_search(monkeypatch, wavy):
@@ -584,128 +515,7 @@ def test_the_time_limit_is_shared_over_the_rungs(wavy, monkeypatch):
     assert result.stopped == "the time limit"
 
 
-def test_a_rung_that_the_time_limit_cut_says_so():
-    result = ff.fit(synthetic_impact()[1], model="auto", max_time=1e-6)
-    (rung,) = result.ladder.rungs
-    assert rung.stopped == result.ladder.stopped == "the time limit"
-    assert rung.chosen
-    assert "richer models were not tried" in result.warnings[0]
-
-
-def test_a_rung_that_cannot_be_simulated_is_left_out(wavy, monkeypatch):
-    original = one_model.identify
-
-    def failing(measurement, model, *rest):
-        if model == "linear+bistable":
-            raise ff.SimulationError("none could be simulated")
-        return original(measurement, model, *rest)
-
-    monkeypatch.setattr(auto.one_model, "identify", failing)
-    monkeypatch.setattr(auto, "LADDER", groups("bistable", "linear+bistable"))
-    result = ff.fit(wavy, model="auto", starts=1, intervals="local")
-    assert result.ladder.skipped == ("linear+bistable: none could be simulated",)
-    monkeypatch.setattr(auto, "LADDER", groups("linear+bistable"))
-    with pytest.raises(ff.SimulationError, match="no model could be tried"):
-        ff.fit(wavy, model="auto", starts=2)
-
-
 # ---------------------------------------------------------------- output
-
-
-@pytest.fixture(scope="module")
-def models_with_ranges():
-    """Names of the models for which `climbed` computes ranges."""
-    return []
-
-
-@pytest.fixture(scope="module")
-def climbed(wavy, models_with_ranges):
-    """Fit two models, neither of which reaches the noise level."""
-    original = one_model.left_open
-
-    def watched(best, *rest):
-        models_with_ranges.append(best.problem.model.name)
-        return original(best, *rest)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(one_model, "left_open", watched)
-        patch.setattr(auto, "LADDER", groups("bistable", "linear+bistable"))
-        return ff.fit(wavy, model="auto", starts=4, intervals="local")
-
-
-def test_ranges_are_made_of_the_chosen_model_alone(climbed, models_with_ranges):
-    """Both models miss the wave; the other model is judged by its 95 % intervals."""
-    result = climbed
-    assert set(models_with_ranges) == {result.model}
-    known = [p for p in result.parameters.values() if p.vary and p.ci95 is not None]
-    assert all(p.range is not None for p in known)
-    states = [name for name, p in result.parameters.items() if p.state == "weak"]
-    assert list(result.ladder.chosen.weak) == states
-    assert any("Ranges were computed for the chosen" in text for text in result.ladder.sentences)
-
-
-def test_what_remains_is_said(climbed):
-    warning = next(
-        text for text in climbed.warnings if text.startswith("Every model leaves systematic")
-    )
-    assert "those of stress_strain are" in warning
-    size = float(warning.split("stress_strain are ")[1].split(" %")[0])
-    assert size == pytest.approx(5 / np.sqrt(2), rel=0.25)  # springs follow part of the wave
-    assert climbed.ladder.ended == "there are no richer ones left to try"
-
-
-def test_undetermined_parameters_of_the_chosen_model_are_named():
-    """This impact is too slow to reach branches c and e."""
-    _, test = synthetic_impact(velocity=1.75, samples=201)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(auto, "LADDER", groups("bistable"))
-        result = ff.fit(test, model="auto", starts=2, intervals="local")
-    (sentence,) = [text for text in result.ladder.cautions if "does not determine" in text]
-    assert "s1_kc" in sentence
-    assert "no model of the ladder has all parameters determined" in sentence
-    assert sentence in result.warnings
-    # determined: k0, eps_a and kh_plus of the spring, contact time and zero of the motion
-    assert result.ladder.chosen.rank <= 5 < result.ladder.chosen.n_vary
-    assert any("combinations" in text for text in result.ladder.sentences)
-    for name in result.ladder.chosen.not_determined:
-        assert result.parameters[name].state == "not determined"
-
-
-def test_the_folder_holds_the_ladder(climbed, tmp_path, monkeypatch):
-    small_pictures(monkeypatch)
-    folder = climbed.save(tmp_path / "auto")
-    content = json.loads((folder / "fit.json").read_text())["ladder"]
-    with (folder / "ladder.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == len(content["rungs"]) == 2
-    for row, rung, original in zip(rows, content["rungs"], climbed.ladder.rungs, strict=True):
-        assert row["model"] == rung["model"] == original.model
-        assert float(row["bic"]) == rung["bic"] == original.bic
-        assert float(row["misfit_stress_strain"]) == original.misfit["stress_strain"]
-        assert row["chosen"] == str(rung["chosen"]) == str(original.chosen)
-        assert row["why"] == rung["why"] != ""
-        assert row["not_determined"].split() == rung["not_determined"]
-    assert "misfit_displacement_time" not in rows[0]
-    assert content["sentences"] == list(climbed.ladder.sentences)
-
-
-def test_the_report_and_the_summary_show_the_ladder(climbed):
-    page = render_report(climbed, fabricated.no_figures())
-    text = summary_text(climbed, verbose=True)
-    assert "Ladder of models" in page
-    for rung in climbed.ladder.rungs:
-        assert rung.why in page
-        assert f"{rung.bic:.0f}".replace("-", "−") in page
-        assert f"{rung.bic:.0f}".replace("-", "−") in text
-        assert f" {rung.rank}/{rung.n_vary} " in text
-        assert f"{rung.name}: {rung.why}" in " ".join(text.split())
-    for sentence in climbed.ladder.sentences:
-        assert sentence.replace("<", "&lt;") in page
-        assert " ".join(text.split()).count(sentence) == 1
-    assert max(map(len, text.splitlines())) <= 100
-    named = ff.fit(short_loop(), starts=1, intervals="local")
-    assert "The simplest model" not in render_report(named, fabricated.no_figures())
-    assert "ladder" not in named.to_json_dict()
 
 
 def run(*args):
@@ -716,9 +526,8 @@ def run(*args):
 def loop_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     loop = short_loop()
-    rows = [f"{s:.6g},{d:.8g}" for s, d in zip(loop.stress, loop.displacement, strict=True)]
-    path = tmp_path / "loop.csv"
-    path.write_text("\n".join(["stress (Pa),displacement (m)", *rows]) + "\n")
+    head = "stress (Pa),displacement (m)"
+    path = write_csv(tmp_path / "loop.csv", head, loop.stress, loop.displacement)
     path.with_suffix(".toml").write_text(
         f'[specimen]\nheight = "{loop.specimen.height} m"\narea = "{loop.specimen.area} m^2"\n'
     )
@@ -730,21 +539,19 @@ def test_the_command_writes_to_auto(loop_file, tmp_path, monkeypatch):
     done = run("fit", loop_file, "--model", "auto", "--starts", 2, "--verbose")
     assert done.exit_code == 0, done.output
     assert "chosen of 1 model tried: bistable: its residuals are random" in done.stdout
-    assert "no richer model was tried" in done.stdout
     folder = tmp_path / "fits" / "loop" / "auto-starts-2"
     content = json.loads((folder / "fit.json").read_text())
     assert content["model"] == "bistable"
     assert [rung["chosen"] for rung in content["ladder"]["rungs"]] == [True]
-    assert (folder / "ladder.csv").is_file()
     page = (folder / "report.html").read_text()
     assert "bistable was chosen of 1 model: it is the simplest" in page
 
 
 def test_the_command_refuses_parameters_of_one_model(loop_file, tmp_path):
-    for option in (("--fix", "s1_eta=0"), ("--vary", "s1_eta")):
+    for option in (("--fix", "s1_eta=0"), ("--vary", "s1_eta"), ("--relaxation", 2)):
         done = run("fit", loop_file, "--model", "auto", *option)
         assert (done.exit_code, done.stdout) == (1, "")
-        assert "belong to one model" in done.stderr
+        assert re.search("belongs? to one model", done.stderr)
     assert not (tmp_path / "fits").exists()
     with pytest.raises(ff.InputError, match="belong to one model"):
         ff.fit(synthetic_loop()[1], model="auto", params=ff.make_params(synthetic_loop()[1]))

@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 import foamfit as ff
+from conftest import write_csv
 from foamfit import Chain
 from foamfit.cli import main
 from foamfit.data.cycles import cycles_of
@@ -24,6 +25,8 @@ TRUTH = ff.MicroscaleSpring(
     5e5, 3e5, 0.25, 1.2e5, 0.4, 5.5e4, 0.6, stiffening=1.8, softening=0.7, weakening=0.4
 )
 AREA, HEIGHT = 5e-5, 0.01
+HEAD = "time (s),force (N),displacement (mm)"
+TOML = '[specimen]\nheight = "10 mm"\narea = "50 mm^2"\n'
 
 
 @pytest.fixture(scope="module")
@@ -36,13 +39,8 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
     strain = np.interp(t, times, corners)
     force = AREA * TRUTH.stress(strain) + 0.05 + rng.normal(0.0, 0.02, t.size)
     moved = 1e3 * HEIGHT * strain + 3.0
-    table = np.column_stack([t + 1.0, force, moved])
-    np.savetxt(
-        folder / "foam.csv", table, "%.6f", ",", header="time (s),force (N),displacement (mm)",
-        comments="",
-    )  # fmt: skip
-    (folder / "foam.toml").write_text('[specimen]\nheight = "10 mm"\narea = "50 mm^2"\n')
-    return folder / "foam.csv"
+    (folder / "foam.toml").write_text(TOML)
+    return write_csv(folder / "foam.csv", HEAD, t + 1.0, force, moved)
 
 
 def test_cycles_are_read_as_one_history(record: Path) -> None:
@@ -78,10 +76,8 @@ def test_what_cannot_be_is_said_in_one_sentence(record: Path, given: list[str], 
 
 def test_cycles_of_a_record_without_any_are_refused(tmp_path: Path) -> None:
     t = np.linspace(0.0, 1.0, 60)
-    table = np.column_stack([t, 0.3 * t, 2e5 * t])
-    np.savetxt(tmp_path / "a.csv", table, "%.6g", ",", header="time (s),strain,stress (Pa)",
-               comments="")  # fmt: skip
-    (tmp_path / "a.toml").write_text('[specimen]\nheight = "10 mm"\narea = "50 mm^2"\n')
+    write_csv(tmp_path / "a.csv", "time (s),strain,stress (Pa)", t, 0.3 * t, 2e5 * t)
+    (tmp_path / "a.toml").write_text(TOML)
     with pytest.raises(ff.InputError, match="cycles 1 to 3 cannot be taken: the record has no"):
         ff.read_test(tmp_path / "a.csv", cycles=(1, 3))
 
@@ -112,20 +108,6 @@ def test_one_set_of_parameters_for_all_cycles_and_the_next(record: Path, tmp_pat
     assert list(found) == ["1", "2", "3", "4"]
     assert found["4"]["misfit"] < 0.01
     assert found["4"]["inside"] > 0.85
-
-
-def test_a_scene_file_may_name_what_a_spring_remembers(tmp_path: Path) -> None:
-    scene = tmp_path / "scene.toml"
-    scene.write_text(
-        '[chain]\narea = "50 mm^2"\n[[chain.springs]]\nkind = "microscale"\nk0 = "0.5 MPa"\n'
-        'kc = "0.3 MPa"\neps_star = 0.25\nsigma_plus = "0.12 MPa"\nspread_plus = 0.4\n'
-        'sigma_minus = "55 kPa"\nspread_minus = 0.6\nsoftening = 0.7\nheight = "10 mm"\n'
-        '[drive]\nkind = "impact"\nmass = "1 kg"\nvelocity = "1 m/s"\n[time]\nend = "40 ms"\n'
-    )
-    from foamfit.scene_file import read_scene
-
-    spring = read_scene(scene)[0].springs[0]
-    assert spring.values[-4:] == (1.0, 0.7, 0.0, 0.0)
 
 
 def test_a_batch_and_a_toml_take_several_cycles(record: Path, tmp_path: Path) -> None:
@@ -168,13 +150,9 @@ def lifted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Chain]:
     assert stress.min() < -2e3  # without separation, the stress would be tensile
     stress = np.maximum(stress, 0.0) + np.where(t < 0.4, 2e3, 0.0)
     force = AREA * (stress + rng.normal(0.0, 100.0, t.size)) + 0.05
-    table = np.column_stack([t, force, 1e3 * HEIGHT * strain + 3.0])
-    np.savetxt(
-        folder / "foam.csv", table, "%.6f", ",", header="time (s),force (N),displacement (mm)",
-        comments="",
-    )  # fmt: skip
-    (folder / "foam.toml").write_text('[specimen]\nheight = "10 mm"\narea = "50 mm^2"\n')
-    return folder / "foam.csv", chain
+    (folder / "foam.toml").write_text(TOML)
+    moved = 1e3 * HEIGHT * strain + 3.0
+    return write_csv(folder / "foam.csv", HEAD, t, force, moved), chain
 
 
 def test_the_stress_between_cycles_is_the_zero_of_a_specimen_that_was_pressed(

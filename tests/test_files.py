@@ -24,7 +24,7 @@ import foamfit.results
 from conftest import EXPERIMENTS, without_pictures
 from foamfit.cli import main
 from foamfit.errors import InputError
-from foamfit.files import check_file, csv_bytes, replacing, sweep, write_file
+from foamfit.files import check_file, csv_bytes, replacing, write_file
 from foamfit.report.folder import check_target, load_result
 from foamfit.report.plots import plot_fit
 from foamfit.report.result_figures import Images
@@ -77,25 +77,20 @@ def test_a_result_with_a_file_of_others_is_refused_and_kept(here: Path) -> None:
     assert names(here) == ["r"]
 
 
-def test_a_folder_or_a_link_in_a_result_is_not_what_a_fit_writes(here: Path) -> None:
-    for made in (Path.mkdir, lambda path: path.symlink_to(here)):
-        fabricated.result().save("r")
-        (here / "r" / "ladder.csv").unlink(missing_ok=True)
-        made(here / "r" / "ladder.csv")
-        with pytest.raises(InputError, match=r"holds ladder\.csv"):
-            check_target("r")
-        if (here / "r" / "ladder.csv").is_symlink():
-            (here / "r" / "ladder.csv").unlink()
-        else:
-            (here / "r" / "ladder.csv").rmdir()
-
-
-@pytest.mark.parametrize("text", ["{}", "[]", "no json", '{"schema": "of another program"}'])
-def test_a_fit_json_of_another_program_makes_no_result(here: Path, text: str) -> None:
-    (here / "r").mkdir()
-    (here / "r" / "fit.json").write_text(text)
-    with pytest.raises(InputError, match="no foamfit result"):
+def test_a_folder_a_link_or_a_json_of_others_is_not_what_a_fit_writes(here: Path) -> None:
+    ladder = fabricated.result().save("r") / "ladder.csv"
+    ladder.mkdir()
+    with pytest.raises(InputError, match=r"holds ladder\.csv"):
         check_target("r")
+    ladder.rmdir()
+    ladder.symlink_to(here)
+    with pytest.raises(InputError, match=r"holds ladder\.csv"):
+        check_target("r")
+    for text in ("{}", "[]", "no json", '{"schema": "of another program"}'):
+        (here / "s").mkdir(exist_ok=True)
+        (here / "s" / "fit.json").write_text(text)
+        with pytest.raises(InputError, match="no foamfit result"):
+            check_target("s")
 
 
 def test_what_is_put_into_the_folder_while_it_is_written_stays(
@@ -114,22 +109,16 @@ def test_what_is_put_into_the_folder_while_it_is_written_stays(
     assert names(here) == ["r"]
 
 
-@pytest.mark.parametrize("out", [".", "..", "{here}", "link", "sub/.."])
-def test_the_current_directory_is_refused_empty_or_not(here: Path, out: str) -> None:
-    (here / "cwd" / "sub").mkdir(parents=True)
+@pytest.mark.parametrize("out", [".", "..", "{here}", "../link"])
+def test_the_current_directory_is_refused(here: Path, out: str) -> None:
+    (here / "cwd").mkdir()
+    (here / "link").symlink_to(here / "cwd")
     os.chdir(here / "cwd")
-    (here / "cwd" / "link").symlink_to(here / "cwd")
-    for empty in (False, True):
-        if empty:
-            (here / "cwd" / "link").unlink()
-            (here / "cwd" / "sub").rmdir()
-            out = "." if out in ("link", "sub/..") else out
-        path = out.format(here=here / "cwd")
-        result = CliRunner().invoke(main, ["fit", str(RECONSTRUCTION), "--out", path])
-        assert (result.exit_code, result.stdout) == (1, "")
-        assert "current directory" in result.stderr
-        assert result.stderr.count("\n") == 1
-        assert Path.cwd() == here / "cwd"
+    path = out.format(here=here / "cwd")
+    result = CliRunner().invoke(main, ["fit", str(RECONSTRUCTION), "--out", path])
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "current directory" in result.stderr
+    assert result.stderr.count("\n") == 1
 
 
 def test_a_link_to_a_result_stays_a_link(here: Path) -> None:
@@ -145,12 +134,7 @@ def test_a_link_to_a_result_stays_a_link(here: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [
-        ("loop", "link|levels|is a file"),
-        ("x" * 300, "too long"),
-        ("file", "is a file"),
-        ("file/r", "a file"),
-    ],
+    [("loop", "link|levels|is a file"), ("x" * 300, "too long"), ("file/r", "a file")],
 )
 def test_what_cannot_be_a_folder_is_said_before_the_fit(here: Path, name: str, words: str) -> None:
     (here / "loop").symlink_to("loop")
@@ -159,32 +143,16 @@ def test_what_cannot_be_a_folder_is_said_before_the_fit(here: Path, name: str, w
         check_target(name)
 
 
-def test_a_mount_point_is_refused(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (here / "mounted").mkdir()
-    monkeypatch.setattr(Path, "is_mount", lambda path: path.name == "mounted")
-    with pytest.raises(InputError, match="mounted is a mount point"):
-        check_target("mounted")
-
-
-def test_a_long_name_leaves_room_for_what_is_beside_it(here: Path) -> None:
-    assert load_result(fabricated.result().save("é" * 127))["schema"] == 1
-    write_file("y" * 255, b"x")
-    assert len(names(here)) == 2
-
-
 # ---------------------------------------------------------------- no incomplete files
 
 
-@pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device")])
-def test_a_full_disk_leaves_the_older_file(
-    here: Path, monkeypatch: pytest.MonkeyPatch, failure: OSError
-) -> None:
+def test_a_full_disk_leaves_the_older_file(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     row = row_of("a", "a.csv", fabricated.result())
     write = Path.write_bytes
 
     def full(path: Path, content: bytes) -> int:
         write(path, content[: len(content) // 2])
-        raise failure
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
     for path, make in (
@@ -209,38 +177,8 @@ def test_no_text_of_a_table_is_a_formula(here: Path) -> None:
     assert ",=" not in text
 
 
-def test_a_full_disk_loses_no_numbers(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the folder cannot be written, the numbers are still printed and the exit code is 1."""
-
-    def full(*_: object, **__: object) -> None:
-        raise InputError("the result cannot be written to r: No space left on device")
-
-    monkeypatch.setattr(foamfit.api.FitResult, "save", full)
-    call = ["fit", str(RECONSTRUCTION), "--starts", "1", "--max-time", "0.1", "--out", "r"]
-    result = CliRunner().invoke(main, call)
-    assert result.exit_code == 1
-    assert "s1_k0" in result.stdout
-    assert "written to" not in result.stdout
-    assert result.stderr == "foamfit: the result cannot be written to r: No space left on device\n"
-
-
 TABLES = ["curves.csv", "fit.json", "parameters.csv", "table.tex"]
 CALL = ("fit", str(RECONSTRUCTION), "--starts", "1", "--max-time", "0.1", "--out", "r")
-
-
-def test_what_cannot_be_written_is_tried_before_the_fit(
-    here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Some file systems report a folder as writable although writing fails."""
-
-    def denied(path: Path, *_: object, **__: object) -> None:
-        raise PermissionError(errno.EPERM, "Operation not permitted")
-
-    monkeypatch.setattr(foamfit.api, "fit", lambda *_, **__: pytest.fail("it was fitted"))
-    monkeypatch.setattr(Path, "mkdir", denied)
-    result = CliRunner().invoke(main, CALL)
-    assert (result.exit_code, result.stdout, names(here)) == (1, "", [])
-    assert "cannot be written to r: Operation not permitted" in result.stderr
 
 
 def test_what_cannot_be_written_in_the_end_is_saved_beside(
@@ -321,34 +259,11 @@ def test_what_a_killed_process_left_is_swept_and_nothing_else(here: Path) -> Non
     recycled.mkdir()
     fabricated.result().save("r")
     assert names(here) == sorted([*(path.name for path in others), "r"])
-    write_file(dead.with_name("a.csv"), b"")
-    left_behind(here / "a.csv", "new", gone()).write_text("half")
-    write_file(here / "a.csv", b"x")
-    assert len([name for name in names(here) if "a.csv" in name]) == 1
-
-
-@posix
-def test_what_another_machine_left_is_swept_after_a_day(here: Path) -> None:
-    dead = left_behind(here / "r", "new", gone())
-    left = here / re.sub(r"^\.r\.[\w-]+", ".r.another-machine", dead.name)
-    left.mkdir()
-    for age, stays in ((3600.0, True), (100_000.0, False)):
-        os.utime(left, (time.time() - age, time.time() - age))
-        with replacing(here / "r"):
-            pass
-        assert left.exists() == stays
-
-
-def test_a_folder_of_many_is_swept_once(here: Path) -> None:
-    dead = left_behind(here / "r", "new", gone())
-    dead.mkdir()
-    with replacing(here / "r", swept=True):
+    a_day = time.time() - 100_000.0
+    os.utime(others[-1], (a_day, a_day))  # a process of another machine cannot be asked
+    with replacing(target):
         pass
-    assert dead.exists()
-    put_aside = left_behind(here / "s", "old", gone())
-    put_aside.mkdir()
-    sweep(here, ["r", "s"])
-    assert names(here) == ["r", "s"]
+    assert not others[-1].exists()
 
 
 @posix

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from conftest import without_pictures
+from conftest import without_pictures, write_csv
 from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.springs import laws
@@ -37,7 +36,6 @@ LAW = ff.Law(
     functions=ff.Functions(stress),
 )
 """
-COMMANDS = ("batch", "check", "compare", "fit", "init", "joint", "page", "predict", "simulate")
 TRUE = {"s1_k": 2e5, "s1_q": 1e6}
 
 
@@ -60,9 +58,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     stress = TRUE["s1_k"] * strain + TRUE["s1_q"] * strain**3
     for seed in (1, 2):
         noise = 500.0 * np.random.default_rng(seed).standard_normal(strain.size)
-        rows = zip(np.arange(61), stress + noise, strain, strict=True)
-        text = "\n".join(["time (s),stress (Pa),strain", *(f"{t},{s},{e}" for t, s, e in rows)])
-        (tmp_path / f"t{seed}.csv").write_text(text + "\n")
+        head = "time (s),stress (Pa),strain"
+        write_csv(tmp_path / f"t{seed}.csv", head, np.arange(61), stress + noise, strain)
         toml = '[specimen]\nheight = "10 mm"\narea = "1 cm^2"\n'
         (tmp_path / f"t{seed}.toml").write_text(toml)
     return tmp_path
@@ -79,11 +76,6 @@ def refused(*words: object) -> str:
     assert re.fullmatch(r"foamfit: [^\n]+\n", told.stderr)
     assert "defect" not in told.stderr
     return told.stderr
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_takes_laws(command: str) -> None:
-    assert "--law FILE.py" in run(command, "--help").stdout
 
 
 def test_a_law_of_a_file_simulates(here: Path, cubic: Path) -> None:
@@ -165,30 +157,3 @@ def test_no_toml_no_result_and_no_browser_names_a_law_file(here: Path) -> None:
     with pytest.raises(InputError, match="law"):
         parsed(["--model", "--law=law.py"]) and laws.law("--law=law.py")
     assert not (here / "run").exists()
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (None, ("none.py", "no such file")),
-        ("x = 1\n", ("none.py", "no law")),
-        ("def f(:\n", ("none.py", "cannot be run", "SyntaxError")),
-        ("raise KeyError('two\\nlines')\n", ("none.py", "cannot be run", "KeyError")),
-        (LAW.replace("return p[0] * strain", "return -p[0] * strain"), ("none.py", "cubic")),
-        (LAW.replace('kind="cubic"', 'kind="+"'), ("none.py", "+")),
-    ],
-)
-def test_what_a_law_file_does_wrong_is_one_sentence(
-    here: Path, text: str | None, words: tuple[str, ...]
-) -> None:
-    if text is not None:
-        (here / "none.py").write_text(text)
-    told = refused("check", "t1.csv", "--law", "none.py")
-    for word in words:
-        assert word in told
-    assert "cubic" not in laws.kinds()
-
-
-def test_a_law_is_loaded_before_anything_else(here: Path) -> None:
-    assert "none.py" in refused("fit", "none.csv", "--model", "rubber", "--law", "none.py")
-    assert "foamfit_law_cubic" not in sys.modules or "cubic" not in laws.kinds()

@@ -275,8 +275,8 @@ def test_the_figure_of_a_stopped_fit_says_so():
 
 
 def test_a_stopped_fit_is_never_ok(monkeypatch):
-    from foamfit import settle
     from foamfit.fitting.search import SearchStoppedError
+    from foamfit.trust import settle
 
     def stop(*_: object, **__: object) -> None:
         raise SearchStoppedError

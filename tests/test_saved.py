@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +19,7 @@ from foamfit.data.measurement import Outliers
 from foamfit.report.studies import batch as tables
 from foamfit.report.studies.batch import Row, row_of
 from foamfit.results import Profile
+from foamfit.study.identified import read_source
 from foamfit.trust.intervals import Intervals
 
 
@@ -54,7 +53,7 @@ def fitted() -> ff.FitResult:
 
 
 def test_a_folder_gives_the_same_result_back(fitted: ff.FitResult, tmp_path: Path) -> None:
-    for i, one in enumerate((fitted, odd(), fabricated.chain_result())):
+    for i, one in enumerate((fitted, odd(), fabricated.microscale_result())):
         first, again = tmp_path / str(i), tmp_path / f"{i} again"
         one.save(first, report=False)
         read = ff.load(first)
@@ -67,13 +66,9 @@ def test_a_folder_gives_the_same_result_back(fitted: ff.FitResult, tmp_path: Pat
         read.save(again, report=False)
         for path in first.iterdir():
             assert path.read_bytes() == (again / path.name).read_bytes(), path.name
-    assert read.measurement.outliers == {}
-    limits = fitted.params["s1_k0"]
-    assert (limits.min, limits.max) == (fitted.params["s1_k0"].min, fitted.params["s1_k0"].max)
-
-
-def test_what_the_test_determines_is_read_back(fitted: ff.FitResult, tmp_path: Path) -> None:
-    read = ff.load(fitted.save(tmp_path / "x", report=False))
+        assert read_source(read).parameters == read_source(one).parameters
+        assert json.dumps(read.to_json_dict()) == json.dumps(one.to_json_dict())
+    read = ff.load(tmp_path / "0")
     assert isinstance(read, ff.FitResult)
     assert fitted.insight is not None
     assert read.insight is not None
@@ -92,6 +87,15 @@ def test_cycles_and_batches_are_read_back(tmp_path: Path) -> None:
     rows = [row_of("-a", "f", odd()), Row("=b", "f", "refused", "no rows")]
     tables.write_summary(rows, tmp_path)
     pd.testing.assert_frame_equal(ff.load(tmp_path), tables.table(rows))
+
+
+@pytest.mark.parametrize("folder", ["foam-1/model-2/stress", "foam-2/impact"])
+def test_results_of_earlier_versions_are_read(folder: str) -> None:
+    path = Path(__file__).parent.parent / "fits" / folder / "fit.json"
+    written = json.loads(path.read_text(encoding="utf-8"))["parameters"]
+    for name, one in read_source(path).parameters.items():
+        found = written.get(name, {"value": 0.0, "stderr": None})
+        assert (one.value, one.stderr) == (found["value"], found["stderr"]), name
 
 
 @pytest.mark.parametrize(
@@ -147,8 +151,8 @@ def test_what_python_and_notebooks_show(fitted: ff.FitResult) -> None:
     assert list(table.index) == list(fitted.parameters)
 
 
-def test_tables_compile(tmp_path: Path) -> None:
-    """Tables with booktabs and unusual names compile; without TeX, only check the structure."""
+def test_tables_have_balanced_braces_and_columns(tmp_path: Path) -> None:
+    """Also with unusual names."""
     strange = "a_1 & 100 % #µ~^\\ {x} [*] <σ> ü 漢 $"
     cycles = ff.CycleFits(strange, "bistable", (1, 2), {1: odd(), 2: fabricated.result()}, {})
     cycles.save(tmp_path / "cycles", report=False)
@@ -166,14 +170,6 @@ def test_tables_compile(tmp_path: Path) -> None:
         assert body.count("{") == body.count("}")
         columns = {row.replace(r"\&", "").count("&") for row in text.splitlines() if "&" in row}
         assert len(columns) == 1
-    if shutil.which("pdflatex") is None:
-        pytest.skip("no pdflatex here: the structure of the tables was checked, not compiled")
-    head = r"\documentclass{article}\usepackage{booktabs}\begin{document}\tiny "
-    text = head + r"\par ".join(made) + r"\end{document}"
-    (tmp_path / "t.tex").write_text(text, encoding="utf-8")
-    command = ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "t.tex"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout[-500:]
 
 
 @pytest.fixture(scope="module")
@@ -201,44 +197,3 @@ def test_samples_of_a_chain_are_kept(chained, tmp_path: Path, monkeypatch) -> No
     monkeypatch.setitem(sys.modules, "xarray", None)
     with pytest.raises(ff.InputError, match=r'pip install "foamfit\[mcmc\]"'):
         _ = read.samples
-
-
-def test_arviz_takes_the_samples(chained) -> None:
-    arviz = pytest.importorskip("arviz", reason="arviz is not installed; no extra brings it")
-    assert "posterior" in arviz.convert_to_inference_data(chained.samples).groups()
-
-
-def test_a_loaded_result_is_compared_and_predicts_as_the_first(tmp_path: Path) -> None:
-    from foamfit.study.identified import read_source
-
-    one = fabricated.microscale_result()
-    one.save(tmp_path / "x", report=False)
-    assert json.dumps(ff.load(tmp_path / "x").to_json_dict()) == json.dumps(one.to_json_dict())
-    assert read_source(ff.load(tmp_path / "x")).parameters == read_source(one).parameters
-
-
-def test_a_measurement_shows_what_it_holds_without_its_samples():
-    shown = repr(odd().measurement)
-    assert shown.startswith("Measurement ")
-    assert "rows of stress" in shown
-    assert len(shown) < 300
-
-
-def test_an_array_is_read_back_if_its_type_is_an_alias(monkeypatch):
-    """From NumPy 2.5 on, `NDArray[kind]` is a type alias with a parameter."""
-    import types
-    from typing import Any
-
-    import numpy as np
-
-    from foamfit import codec
-
-    plain = np.ndarray[tuple[Any, ...], np.dtype[np.float64]]
-    alias = types.SimpleNamespace(__value__={(np.float64,): plain})
-    found = {"alias": (alias, (np.float64,))}
-    monkeypatch.setattr(codec, "get_origin", lambda hint: found.get(hint, (None,))[0]
-                        if isinstance(hint, str) else np.ndarray)  # fmt: skip
-    own = codec.get_args
-    monkeypatch.setattr(codec, "get_args", lambda hint: found[hint][1] if isinstance(hint, str)
-                        else own(hint))  # fmt: skip
-    np.testing.assert_array_equal(codec.decode("alias", [1.0, "nan"], {}), [1.0, np.nan])

@@ -12,8 +12,6 @@ from .fitting.problem import make_params as make_params
 from .report.studies.cycles import CycleFits as CycleFits
 from .report.studies.plan import Plan as Plan
 from .report.studies.prediction import Prediction as Prediction
-from .saved import SavedJoint as SavedJoint
-from .saved import load as load
 from .solve.simulation import Response as Response
 from .solve.simulation import simulate as simulate
 from .springs.chain import (
@@ -56,5 +54,6 @@ from .study.joint import joint as joint
 from .study.joint_result import JointResult as JointResult
 from .study.plan import plan as plan
 from .study.predict import predict as predict
+from .study.saved import load as load
 
 __version__: str

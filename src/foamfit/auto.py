@@ -27,8 +27,9 @@ from foamfit.fitting.problem import Problem, make_params
 from foamfit.fitting.search import SearchStoppedError, what_stopped
 from foamfit.one_model import Found, Options, Progress
 from foamfit.options import FREED
+from foamfit.parts import Ladder, Rung, rung_name
 from foamfit.report import render
-from foamfit.results import Fit, Ladder, Rung, rung_name
+from foamfit.results import Fit
 from foamfit.springs import laws
 from foamfit.springs.model import Model, with_options
 from foamfit.springs.parameters import NUISANCE, family, split_name

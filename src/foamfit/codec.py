@@ -39,47 +39,51 @@ def reading(what: str) -> Iterator[None]:
     raise InputError(f"{what} cannot be read back: {fault}; fit again")
 
 
-def encode(value: Any, columns: Columns | None = None) -> Any:
+def plain(value: Any, columns: Columns | None = None) -> Any:
     """Return a value in JSON types; a dataclass becomes an object of its fields.
 
-    A number that is not finite becomes its name, or None without `columns`.
+    Fields that are None and have "omitted" in their metadata are left out. A number that is not
+    finite becomes its name, or None without `columns`.
     """
     if hasattr(value, "valuesdict"):  # lmfit's parameters, whose own writer pickles functions
         every = {
             name: {key: getattr(one, key) for key in _PARAMETER} for name, one in value.items()
         }
-        return encode(every, columns)
+        return plain(every, columns)
     if isinstance(value, Mapping):
-        return {str(key): encode(item, columns) for key, item in value.items()}
+        return {str(key): plain(item, columns) for key, item in value.items()}
     if isinstance(value, Spring):
         relaxation = [list(term) for term in value.relaxation]
         return {"kind": value.law.kind, "values": list(value.values), "relaxation": relaxation}
     if is_dataclass(value):
-        return {one.name: encode(getattr(value, one.name), columns) for one in fields(value)}
+        kept = ((one.name, getattr(value, one.name), one.metadata) for one in fields(value))
+        return {
+            name: plain(item, columns)
+            for name, item, about in kept
+            if item is not None or "omitted" not in about
+        }
     if isinstance(value, np.ndarray):
         pairs = (columns or {}).items()
         same = (name for name, one in pairs if np.array_equal(one, value, equal_nan=True))
         name = next(same, None)
-        return encode(value.tolist(), columns) if name is None else {"column": name}
+        return plain(value.tolist(), columns) if name is None else {"column": name}
     if isinstance(value, np.generic | PurePath):
-        return encode(value.item() if isinstance(value, np.generic) else str(value), columns)
+        return plain(value.item() if isinstance(value, np.generic) else str(value), columns)
     if isinstance(value, list | tuple):
-        return [encode(item, columns) for item in value]
+        return [plain(item, columns) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None if columns is None else str(value)
     return value
 
 
 def decode(hint: Any, value: Any, columns: Columns) -> Any:
-    """Invert `encode` for a value of type `hint`; raises the errors of `build`."""
+    """Invert `plain` for a value of type `hint`; raises the errors of `build`."""
     origin, inner = get_origin(hint), get_args(hint)
     if hasattr(origin, "__value__"):  # NDArray of NumPy 2.5 is a type alias with a parameter
-        hint = origin.__value__[inner]
-        origin, inner = get_origin(hint), get_args(hint)
+        return decode(origin.__value__[inner], value, columns)
     if origin in (Union, types.UnionType):
         arms = [arm for arm in inner if arm is not type(None)]
-        hint = arms[0] if len(arms) == 1 else Any
-        return None if value is None else decode(hint, value, columns)
+        return None if value is None else decode(arms[0] if len(arms) == 1 else Any, value, columns)
     if origin is np.ndarray:  # NDArray[kind]: its last argument is dtype[kind]
         given = columns[value["column"]] if isinstance(value, Mapping) else _finite_or_not(value)
         return np.array(given, dtype=get_args(inner[-1])[0])
@@ -87,12 +91,11 @@ def decode(hint: Any, value: Any, columns: Columns) -> Any:
         each = (inner[0],) * len(value) if inner[-1] is Ellipsis else inner
         return tuple(decode(one, item, columns) for one, item in zip(each, value, strict=True))
     if origin in (dict, Mapping):
-        name, kind = inner
-        return {name(key): decode(kind, item, columns) for key, item in value.items()}
+        return {inner[0](key): decode(inner[1], item, columns) for key, item in value.items()}
     if hint is float:
         return math.nan if value is None else float(value)
-    if isinstance(hint, type) and issubclass(hint, PurePath):
-        return hint(value)
+    if hint is str:
+        return "" if value is None else value
     if hint is Spring:
         from foamfit.springs import laws
 
@@ -101,12 +104,13 @@ def decode(hint: Any, value: Any, columns: Columns) -> Any:
     if hasattr(hint, "valuesdict"):
         return _parameters(hint(), _finite_or_not(value))
     if is_dataclass(hint):
-        assert isinstance(hint, type)
         return build(hint, value, columns)
+    if isinstance(hint, type) and issubclass(hint, PurePath):
+        return hint(value)
     return _finite_or_not(value) if hint is Any else value
 
 
-def build(made: type, content: Mapping[str, Any], columns: Columns, **names: Any) -> Any:
+def build(made: Any, content: Mapping[str, Any], columns: Columns, **names: Any) -> Any:
     """Make a dataclass from its encoded fields; fields with a default may be missing.
 
     `names` are the names in its annotations that its module imports for typing only. Raises

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from numbers import Integral
 
 
 class InputError(ValueError):
@@ -16,6 +17,14 @@ class InputError(ValueError):
     def __init__(self, message: str = "", lines: Sequence[str] = ()) -> None:
         super().__init__(message)
         self.lines = lines
+
+
+def check_whole(name: str, value: object, least: int) -> None:
+    """Raise InputError unless an argument is a whole number from `least` up."""
+    if not isinstance(value, Integral) or isinstance(value, bool) or int(value) < least:
+        raise InputError(
+            f"{name} = {value!r} is not admissible; it must be a whole number from {least} up"
+        )
 
 
 @contextmanager

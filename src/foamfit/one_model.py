@@ -34,7 +34,14 @@ from foamfit.fitting.search import (
 )
 from foamfit.options import DRAWS, FREED, STARTS, STARTS_IN_SERIES, Given, Watch
 from foamfit.results import Fit, Intervals, plain
-from foamfit.settle import (
+from foamfit.solve.cache import SPENT
+from foamfit.springs.model import Model, with_options
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.conclude import conclude
+from foamfit.trust.covariance import AT_LIMIT
+from foamfit.trust.intervals import Announce, Choice, assess, evaluations_of
+from foamfit.trust.ranges import Open, left_open
+from foamfit.trust.settle import (
     back_to_plain,
     descend_again,
     follow_samples,
@@ -43,13 +50,6 @@ from foamfit.settle import (
     refine,
     weigh_motion,
 )
-from foamfit.solve.cache import SPENT
-from foamfit.springs.model import Model, with_options
-from foamfit.trust.best_point import BestPoint
-from foamfit.trust.conclude import conclude
-from foamfit.trust.covariance import AT_LIMIT
-from foamfit.trust.intervals import Announce, Choice, assess, evaluations_of
-from foamfit.trust.ranges import Open, left_open
 
 Progress = Callable[[float, str], None]
 # Budget of the profiles, and of the ranges, as a multiple of the evaluations of the search, and the

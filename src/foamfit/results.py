@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.codec import encode
+from foamfit.codec import plain as plain
 from foamfit.data.calibration import Contradiction
 from foamfit.data.cycles import cycles_of, loading_rate
 from foamfit.data.measurement import Measurement, interior_channel
-from foamfit.options import FREED
+from foamfit.parts import Ladder
+from foamfit.parts import ParameterEstimate as ParameterEstimate
+from foamfit.parts import law_in_words as law_in_words
 from foamfit.springs.chain import Chain
 from foamfit.springs.spring import Spring
-from foamfit.text import counted, listed
 
 if TYPE_CHECKING:
     import lmfit
@@ -29,38 +30,6 @@ SCHEMA = 1
 # Sources of an uncertainty budget; those in `STATED` have a ± in the TOML and are not fitted.
 STATED = ("mass", "height", "area", "calibration")
 SOURCES = ("noise", "contact and zero", "velocity", *STATED, "law")
-
-
-@dataclass(frozen=True)
-class ParameterEstimate:
-    """One identified parameter, in SI.
-
-    `stderr` and `ci95` are None where the test does not determine the parameter; `state` is
-    "determined", "weak", "not determined" or "fixed" (by the user or the model), and `why` gives
-    the reason in a sentence. `ci95_method` is the source of the interval: "local covariance",
-    "profile likelihood", "MCMC" or "other minima" (minima of the search that different noise could
-    have made the best). `range` includes model error: the values that fit almost equally well; None
-    where the residuals are noise. `systematic` is one standard deviation from the ± of height,
-    area, mass and calibration in the TOML; `stderr` and `ci95` do not include it. It is 0 where no
-    ± is stated or the test does not determine the parameter.
-    """
-
-    value: float
-    stderr: float | None
-    ci95: tuple[float, float] | None
-    unit: str
-    vary: bool
-    state: str
-    why: str
-    ci95_method: str | None = None
-    range: tuple[float, float] | None = None
-    systematic: float = 0.0
-
-    def counted_from(self, zero: float) -> ParameterEstimate:
-        """Shift value, interval and range to another zero."""
-        pairs = (self.ci95, self.range)
-        ci95, span = (pair and (pair[0] - zero, pair[1] - zero) for pair in pairs)
-        return replace(self, value=self.value - zero, ci95=ci95, range=span)
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,97 +221,6 @@ class Check:
     fatal: bool = False  # whether a "no" means that no acceptable fit was found
 
 
-def rung_name(model: str, damping: str, relaxation: int = 0) -> str:
-    """Describe model, relaxation and damping in words."""
-    words, more = _in_words(model)
-    if relaxation:
-        more.append("relaxation" if relaxation == 1 else counted(relaxation, "relaxation term"))
-    if not more:
-        return words if damping == "none" else f"{words} {damping} damping"
-    more += ["damping"] * (damping == "with")
-    return f"{words} with {listed(more)}{', without damping' if damping == 'without' else ''}"
-
-
-def _in_words(model: str) -> tuple[str, list[str]]:
-    """Return a model as `--model` takes it, and the parameters that its options free."""
-    from foamfit.springs.model import Model  # drawing needs no compiler
-
-    if model == "auto":
-        return model, []
-    parsed = Model.parse(model)
-    options = (name for name, is_set in parsed.options.items() if is_set)
-    return parsed.words, [parameter for name in options for parameter in FREED[name]]
-
-
-@dataclass(frozen=True)
-class Rung:
-    """One model of the comparison and the evidence for it."""
-
-    model: str  # springs from the base up
-    # "with", "without" (every dashpot fixed at zero) or "none" (no dashpot to vary in this drive)
-    damping: str
-    misfit: dict[str, float | None]  # as `Fit.misfit`
-    chisqr: float  # sum of the squared residuals
-    n_vary: int  # number of varied parameters
-    rank: int  # number of their combinations that the curves fix, used in AICc and BIC
-    n_eff: float  # effective samples by its own residuals; AICc and BIC use `Ladder.n_eff`
-    aicc: float  # infinite with too few effective samples for the number of parameters
-    bic: float
-    runs_p: float  # p-value of the runs test, which uses the signs of the residuals
-    neighbours_p: float  # p-value of the neighbours test, which also uses their sizes
-    # Parameters in these states; from the 95 % intervals alone unless this model was chosen
-    not_determined: tuple[str, ...]
-    weak: tuple[str, ...]
-    seconds: float  # run time
-    stopped: str | None  # what ended the search early
-    chosen: bool  # whether the result is from this model
-    why: str  # why it was chosen or not
-    relaxation: int = 0  # terms of each hysteretic spring
-    # RMS over range of held-out samples (cross-validation in blocks); None if time ran out
-    predicted_misfit: float | None = None
-    gain: float | None = None  # its relative reduction against `gain_over`, if any
-    # The best earlier model with no more parameters; None for the first
-    gain_over: str | None = None
-
-    @property
-    def name(self) -> str:
-        """Model, relaxation and damping in words."""
-        return rung_name(self.model, self.damping, self.relaxation)
-
-
-@dataclass(frozen=True)
-class Ladder:
-    """Comparison of several models."""
-
-    rungs: tuple[Rung, ...]  # in the order of the trials, from the simplest up
-    n_eff: float  # effective samples in AICc and BIC
-    noise_from: str  # the model of the least chi-square, whose residuals are taken as noise
-    ended: str  # why the comparison ended
-    stopped: str | None  # "the time limit" or "Ctrl-C" if that ended it
-    skipped: tuple[str, ...]  # models that could not be tried, and why
-    sentences: tuple[str, ...]  # conclusions
-    cautions: tuple[str, ...]  # the conclusions that are warnings
-    # Whether predictions decide (no model reaches the noise) instead of AICc and BIC
-    by_prediction: bool = False
-
-    @property
-    def chosen(self) -> Rung:
-        """The model of the result."""
-        return next(rung for rung in self.rungs if rung.chosen)
-
-    def rows(self) -> Iterator[dict[str, object]]:
-        """Yield the rows of ladder.csv; names in a list are separated by spaces."""
-        misfits = [rung.misfit for rung in self.rungs]
-        curves = [name for name in misfits[0] if any(one.get(name) is not None for one in misfits)]
-        for rung in self.rungs:
-            row: dict[str, Any] = plain(rung)
-            misfit = row.pop("misfit")
-            cells = {"model": row.pop("model"), "damping": row.pop("damping")}
-            cells |= {f"misfit_{name}": misfit.get(name) for name in curves}
-            cells |= {k: " ".join(v) if isinstance(v, list) else v for k, v in row.items()}
-            yield cells
-
-
 def loop_of(test: Measurement, along: Array | None, over_time: Array | None) -> Loop | None:
     """Return the loop of a test against strain, or else against time; None without stress.
 
@@ -354,13 +232,6 @@ def loop_of(test: Measurement, along: Array | None, over_time: Array | None) -> 
     if test.stress is None or test.time is None:
         return None
     return Loop(test.name, test.time, "time (s)", test.stress, over_time)
-
-
-def law_in_words(model: str, relaxation: int) -> str:
-    """Describe a model, the parameters that its options free, and its relaxation in words."""
-    words, more = _in_words(model)
-    more += [counted(relaxation, "relaxation term")] if relaxation else []
-    return f"{words} with {listed(more)}" if more else words
 
 
 @dataclass(frozen=True, eq=False)
@@ -425,7 +296,9 @@ class Fit:
     @property
     def words(self) -> str:
         """The model as `--model` takes it."""
-        return _in_words(self.model)[0]
+        from foamfit.springs.model import Model  # drawing needs no compiler
+
+        return Model.parse(self.model).words
 
     @property
     def by_cycle(self) -> dict[int, dict[str, Any]]:
@@ -549,7 +422,7 @@ class Fit:
         }
         encoded: dict[str, Any] = plain(content)
         columns = self.columns
-        fields = {name: encode(getattr(self, name), columns) for name in KEPT}
+        fields = {name: plain(getattr(self, name), columns) for name in KEPT}
         rest = _without(encoded, fields)
         rest["measurement"] = _without(encoded | encoded["data"], fields["measurement"])
         length = max((column.size for column in columns.values()), default=0)
@@ -601,8 +474,3 @@ KEPT = tuple(name for name in Fit.__dataclass_fields__ if name not in BESIDE)
 def _without(content: Mapping[str, Any], fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields that `content` does not already have with the same value."""
     return {k: value for k, value in fields.items() if k not in content or value != content[k]}
-
-
-def plain(value: Any) -> Any:
-    """Return `value` in JSON types, with None for every number that is not finite."""
-    return encode(value)

@@ -17,8 +17,8 @@ from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import fix_and_vary, make_params
 from foamfit.fitting.search import Tracker
 from foamfit.one_model import Options
-from foamfit.settle import keep_to_record
 from foamfit.springs.model import Model
+from foamfit.trust.settle import keep_to_record
 
 sys.path.insert(0, str(EXPERIMENTS / "recovery"))
 import rig

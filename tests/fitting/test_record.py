@@ -15,7 +15,7 @@ import pytest
 import foamfit as ff
 from foamfit.fitting.search import SearchStoppedError, Tracker
 from foamfit.one_model import Options, identify
-from foamfit.settle import descend_again
+from foamfit.trust.settle import descend_again
 
 HEIGHT, AREA = 15e-3, 7.07e-4  # m, m²
 OFFSET, BIAS = 3.1e-3, 0.21e6  # zeros of motion, m, and stress, Pa, in the file

@@ -92,6 +92,23 @@ def test_no_number_in_the_json_is_other_than_finite() -> None:
     assert content["energy"] == {"lost_J": [1.0, None]}
 
 
+def test_parameters_csv(saved: Path) -> None:
+    table = {row["name"]: row for row in rows(saved / "parameters.csv")}
+    assert float(table["s1_k0"]["ci95_lo"]) == 5370640.0
+    assert table["s1_kh_minus"]["stderr"] == table["s1_kh_minus"]["ci95_hi"] == ""
+    assert table["s1_kh_minus"]["state"] == "not determined"
+
+
+def test_curves_csv_gives_the_curves_back(saved: Path) -> None:
+    table = rows(saved / "curves.csv")
+    curves = fabricated.result().curves
+    assert list(table[0]) == [
+        "time (s)", "measured stress (Pa)", "fitted stress (Pa)", "measured displacement (m)",
+        "fitted displacement (m)", "stress along measured displacement (Pa)",
+    ]  # fmt: skip
+    assert [float(row["measured stress (Pa)"]) for row in table] == list(curves.measured_stress)
+
+
 @pytest.mark.usefixtures("no_figures")
 def test_masses_inside_have_their_columns(tmp_path: Path) -> None:
     result = fabricated.result()

@@ -22,9 +22,10 @@ import fabricated
 from conftest import ROOT
 from foamfit.cli import main
 from foamfit.data.measurement import Dropped, RowCount
+from foamfit.parts import Ladder, Rung
 from foamfit.report.comparison import compare, comparison_text
 from foamfit.report.summary import summary_text
-from foamfit.results import Check, Fit, Ladder, Rung
+from foamfit.results import Check, Fit
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 RENEW = "FOAMFIT_RENEW_GOLDEN"

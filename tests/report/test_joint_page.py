@@ -17,7 +17,7 @@ from foamfit.fitting.together import Together
 from foamfit.report.figures import image
 from foamfit.report.studies.joint import joint_page, joint_text, plot_compared, plot_joint
 from foamfit.study.joint_fit import Alternative, fit_jointly
-from foamfit.study.joint_result import JointResult, common_covariance, parameters_of
+from foamfit.study.joint_result import JointResult, result_of
 from foamfit.study.study_file import Study
 
 RATES = (0.01, 0.1, 1.0)
@@ -57,18 +57,16 @@ def found(tmp_path_factory) -> JointResult:
         here, "a & b", tuple((name, here, None) for name in names), "microscale", 0,
         "displacement", KINDS, {}, 0, None, None,
     )  # fmt: skip
-    return JointResult(
-        study=study, tests=names, files=(here,) * 3, rates=RATES, rate0=0.1, fit=fit,
-        parameters=parameters_of(fit, names),
-        covariance=common_covariance(fit),
-        evidence=(
-            Alternative("s1_sigma_plus", "log rate", True, 10.0, 13, 300.0),
-            Alternative("s1_sigma_plus", "own", False, 14.0, 14, 299.0),
-        ),
-        alone=Together.of_own_fits(problems, vectors), refused={}, status="warnings",
-        warnings=("x.csv is left out: it holds <nothing>.",), sentences=("One sentence.",),
-        runtime_s=1.0,
-    )  # fmt: skip
+    evidence = (
+        Alternative("s1_sigma_plus", "log rate", True, 10.0, 13, 300.0),
+        Alternative("s1_sigma_plus", "own", False, 14.0, 14, 299.0),
+    )
+    files, alone = dict.fromkeys(names, here), Together.of_own_fits(problems, vectors)
+    made = result_of(
+        study, files, RATES, 0.1, fit, alone, {}, evidence=evidence, refused={}, runtime_s=1.0
+    )
+    words = {"warnings": ("x.csv is left out: it holds <nothing>.",), "sentences": ("Said.",)}
+    return replace(made, status="warnings", **words)
 
 
 @pytest.fixture(scope="module")
@@ -108,10 +106,9 @@ def test_the_page_tells_the_noise_of_each_test_beside_its_share_of_chi2(found, p
     assert row[at] == "400.0<i>stated</i>"
     # an estimated noise level is increased to account for correlation
     level = {"sigma": 250.0, "given": False, "time": 2.5, "scale": 1e3, "range": 1e5}
-    one, *others = found.noise
-    vars(found)["noise"] = ({"stress_strain": level}, *others)
-    told = joint_page(found, Path(), b"<svg/>", b"<svg/>")
-    vars(found)["noise"] = (one, *others)
+    first = replace(found.tests["first"], noise={"stress_strain": level})
+    changed = replace(found, tests=found.tests | {"first": first})
+    told = joint_page(changed, Path(), b"<svg/>", b"<svg/>")
     assert "250.0<i>estimated, correlated over 2.5 samples, counted as 1000<" in told
 
 
@@ -162,6 +159,12 @@ def test_parameters_stand_side_by_side(found):
     assert "beyond the panel" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
+def at_rates(found, *rates):
+    """Return the tests with other rates (1/s)."""
+    pairs = zip(found.tests.items(), rates, strict=True)
+    return {name: replace(one, rate=rate) for (name, one), rate in pairs}
+
+
 def test_twins_whose_rates_differ_a_little_stand_in_their_order(found):
     parameters = {n: p for n, p in found.parameters.items() if p.kind != "log rate"}
     names = ("heel-10_raw", "heel-11_raw", "heel-9_raw")
@@ -173,7 +176,9 @@ def test_twins_whose_rates_differ_a_little_stand_in_their_order(found):
     assert repr(shown).startswith("a & b: microscale · 3 tests together · status warnings")
     assert "a &amp; b" in shown._repr_html_()
     assert len(shown.plot(Figure().subplots()).lines) == 6
-    twins = replace(found, parameters=own, tests=names, rates=(0.231, 0.224, 0.239))
+    pairs = zip(names, at_rates(found, 0.231, 0.224, 0.239).values(), strict=True)
+    loops = tuple(one._replace(name=name) for one, name in zip(found.loops, names, strict=True))
+    twins = replace(found, parameters=own, tests=dict(pairs), loops=loops)
     (top,) = plot_joint(twins).subfigs
     assert [ax.get_title() for ax in top.axes] == list(names)
     labels = plot_compared(twins).axes[0].get_yticklabels()

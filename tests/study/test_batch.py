@@ -7,17 +7,13 @@ import errno
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -26,20 +22,13 @@ from click.testing import CliRunner
 
 import fabricated
 import foamfit as ff
-from conftest import HEIGHT, synthetic_impact, without_pictures
+from conftest import HEIGHT, synthetic_impact, without_pictures, write_csv
 from foamfit.cli import main
 from foamfit.cli import many as command
 from foamfit.report.studies import batch as batch_report
-from foamfit.report.studies.batch import (
-    MOST_ON_PAGE,
-    Row,
-    row_of,
-    table_rows,
-    write_comparison,
-    write_page,
-)
+from foamfit.report.studies.batch import Row, row_of, write_comparison, write_page
 from foamfit.study import batch as module
-from foamfit.study import batch_work, processes
+from foamfit.study import batch_work
 from foamfit.study.batch_work import work
 from foamfit.study.processes import ATTEMPTS, EndedError, Processes
 from foamfit.terminal import TerminatedError
@@ -56,9 +45,8 @@ TOML = (
 def write(folder: Path, name: str, seed: int) -> None:
     _, test = synthetic_impact(noise=0.003, seed=seed, samples=101)
     columns = (1e3 * test.time, 1e-6 * test.stress, 1e3 * test.displacement)
-    lines = [",".join(f"{x:.6f}" for x in row) for row in zip(*columns, strict=True)]
-    header = "time (ms),stress (MPa),displacement (mm)"
-    (folder / f"{name}.csv").write_text("\n".join([header, *lines]) + "\n")
+    head = "time (ms),stress (MPa),displacement (mm)"
+    write_csv(folder / f"{name}.csv", head, *columns, fmt="%.6f")
 
 
 @pytest.fixture
@@ -147,27 +135,19 @@ def undrawn(monkeypatch):
     monkeypatch.setattr(batch_report, "write_both", lambda *_: b"<svg/>")
 
 
-def test_reports_are_there_unless_they_are_not_wanted(here, tried, undrawn):
+def test_figures_of_another_width_are_made_again_where_there_are_any(here, tried, undrawn):
     again(report=False)
-    assert len(tried) == 3
     again(report=True, figure_width="two")  # the reports are missing
     assert len(tried) == 6
     assert {"report.html", "fit.png", "fit.pdf"} <= set(names("out/a"))
     assert 'href="a/report.html"' in Path("out/summary.html").read_text()
-    again(report=False)
-    assert len(tried) == 6
-
-
-def test_figures_of_another_width_are_made_again_where_there_are_any(here, tried, undrawn):
-    again(report=True, figure_width="two")
-    assert len(tried) == 3
+    tried.clear()
     again(report=True, figure_width="177.8 mm")  # two columns
     again(report=False)
-    assert len(tried) == 3
+    assert tried == []
     again(report=True, figure_width="one")
-    assert len(tried) == 6
     again(report=True, figure_width="3.25 in")
-    assert len(tried) == 6
+    assert len(tried) == 3
     with pytest.raises(ff.InputError, match="the width of figures = 'narrow'"):
         again(report=True, figure_width="narrow")
 
@@ -220,15 +200,6 @@ def test_only_what_is_missing_or_has_changed_is_fitted(here, tried):
         assert sorted(tried) == (["a", "b", "c", "d"] if wanted is None else wanted)
 
 
-def test_another_version_fits_again(here, tried, monkeypatch):
-    again()
-    monkeypatch.setattr(batch_work, "version", lambda _: "99.0")
-    monkeypatch.setattr("foamfit.results.version", lambda _: "99.0")
-    tried.clear()
-    again()
-    assert tried == ["a", "b", "c"]
-
-
 def test_a_test_that_became_unreadable_loses_its_old_result(here, tried):
     again()
     (here / "tests/a.csv").write_text("nothing")
@@ -239,15 +210,6 @@ def test_a_test_that_became_unreadable_loses_its_old_result(here, tried):
 
 
 # ------------------------------------------------------------------------- failures
-
-
-@posix
-def test_a_broken_link_is_a_row(here, tried):
-    (here / "tests/gone.csv").symlink_to("nowhere.csv")
-    (here / "tests/loop.csv").symlink_to("loop.csv")
-    rows = again().set_index("file")["error"]
-    assert "no such file" in rows["tests/gone.csv"]
-    assert "symbolic links" in rows["tests/loop.csv"]
 
 
 def test_a_defect_is_a_row_and_ends_nothing(here, tried, monkeypatch):
@@ -302,19 +264,6 @@ if not seen.exists():
 """
 
 
-@posix
-def test_what_another_thread_imports_while_a_process_starts_stays_imported(monkeypatch):
-    """`unittest.mock.patch.dict` would restore `sys.modules` and so drop the new module."""
-    name = "foamfit_imported_in_the_meantime"
-    monkeypatch.delitem(sys.modules, name, raising=False)
-    script = sys.modules["__main__"]
-    with processes._starting():
-        assert sys.modules["__main__"] is not script
-        sys.modules[name] = ModuleType(name)
-    assert name in sys.modules
-    assert sys.modules["__main__"] is script
-
-
 def test_one_process_that_ends_takes_nothing_else_with_it(tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     with Processes(2) as pool:
@@ -354,59 +303,6 @@ def test_ctrl_c_and_sigterm_leave_what_is_done_and_a_summary(here, tried, end):
     assert shown("out") == [
         ("a", "warnings"), ("b", "not fitted"), ("bad", "not fitted"), ("c", "not fitted"),
     ]  # fmt: skip
-
-
-def test_what_is_killed_leaves_a_page_as_current_as_the_table(here, tried, monkeypatch):
-    """A killed process cannot write anything afterwards, so the page must already be current."""
-    monkeypatch.setattr(module, "PAUSE", 0.0)
-    monkeypatch.setattr(module, "SHARE", 0.0)
-    seen = list[tuple[list[tuple[str, str]], list[str]]]()
-
-    def look(made):
-        if len(made.rows) > 1:
-            frame = pd.read_csv("out/summary.csv")
-            seen.append((shown("out"), list(frame["status"])))
-
-    again(progress=look)
-    assert [len(one) for one, _ in seen] == [4, 4, 4]
-    for page, table in seen:
-        assert [status for _, status in page] == table
-    assert [status for _, status in seen[0][0]] == ["warnings", *["not fitted"] * 3]
-
-
-def test_the_pages_of_a_long_batch_take_a_fiftieth_of_its_time(here, tried, monkeypatch):
-    """Each page takes longer than the one before, so the interval between pages grows."""
-    clock, saved = [0.0], list[float]()
-
-    def save(made, *, whole=False):
-        saved.append(clock[0])
-        clock[0] += 1.0  # s
-
-    monkeypatch.setattr(module.time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(module.Batch, "save", save)
-
-    def second(state):
-        clock[0] += 1.0
-
-    for number in range(20):
-        shutil.copy(here / "tests/c.csv", here / f"tests/t{number:02d}.csv")
-    again(progress=second)
-    assert saved == [5.0, 25.0]  # s: after the interval, and at the end
-
-
-def test_ctrl_c_leaves_what_is_done_and_a_summary(here, monkeypatch):
-    monkeypatch.setattr(module, "work", unfitted)
-
-    def interrupt(state):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        again(executor=None, jobs=1, progress=interrupt)
-    frame = pd.read_csv("out/summary.csv").set_index("test")
-    assert frame.loc["a", "status"] == "warnings"
-    assert list(frame["status"][["b", "c"]]) == ["not fitted", "not fitted"]
-    assert "call it again" in frame.loc["c", "error"]
-    assert not [name for name in names("out") if name.startswith(".")]
 
 
 def test_a_full_disk_ends_in_one_sentence_and_loses_nothing(here, tried, monkeypatch):
@@ -560,42 +456,17 @@ class Local(Inline):
         """Do nothing: there is no process to stop."""
 
 
-def test_progress_says_done_wrong_left_and_how_long(here, monkeypatch):
-    shown = []
-    line = SimpleNamespace(progress=lambda share, what: shown.append((share, what)))
-    monkeypatch.setattr(command, "progress_line", lambda *_: nullcontext(line))
-
-    def fitted(*_, progress, **__):
-        tests = range(10)
-        progress(SimpleNamespace(rows=tests[:4], tests=tests, wrong=1, fitted=2))
-        progress(SimpleNamespace(rows=tests, tests=tests, wrong=1, fitted=8))
-        return SimpleNamespace(summary=[], out=here)
-
-    monkeypatch.setattr(module, "run", fitted)
-    run("batch", "tests", "--json")
-    # Tests finished by an earlier call do not enter the estimate of the time left.
-    assert shown == [
-        (0.25, "4 done, 1 without a fit, 6 left"),
-        (1.0, "10 done, 1 without a fit, 0 left"),
-    ]
-
-
-def test_without_dask_the_command_says_how_it_is_installed(here, monkeypatch):
-    monkeypatch.setitem(sys.modules, "dask.distributed", None)
-    result = run("batch", "tests", "--scheduler", "tcp://127.0.0.1:1")
-    assert result.exit_code == 1
-    assert result.stderr == (
-        'foamfit: --scheduler needs Dask, which is not installed: pip install "foamfit[dask]"\n'
-    )
-
-
-def test_a_scheduler_that_does_not_answer_is_one_sentence(here, monkeypatch):
+def test_a_scheduler_that_cannot_be_reached_is_one_sentence(here, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(command, "PATIENCE", 0.3)
     for address in ("tcp://127.0.0.1:1", "nonsense://x"):
         result = run("batch", "tests", "--scheduler", address, "--out", "out")
         assert (result.exit_code, result.stdout) == (1, "")
         assert re.fullmatch(r"foamfit: --scheduler [^\n]+no Dask scheduler[^\n]+\n", result.stderr)
+    monkeypatch.setitem(sys.modules, "dask.distributed", None)
+    result = run("batch", "tests", "--scheduler", "tcp://127.0.0.1:1")
+    assert result.exit_code == 1
+    assert result.stderr.endswith('is not installed: pip install "foamfit[dask]"\n')
     assert not Path("out").exists()
 
 
@@ -631,36 +502,6 @@ def test_a_dask_cluster_loses_a_worker_and_no_test(here):
     again(starts=2, out="local")
     assert len(numbers("out")) == 3
     assert numbers("out") == numbers("local")
-
-
-def test_one_fit_compiles_what_all_need_before_the_others_start(here, monkeypatch):
-    order, second = [], threading.Event()
-
-    class Slow(ThreadPoolExecutor):
-        def submit(self, fn, /, task):
-            order.append(f"{task.name} given")
-            if len(order) > 1:
-                second.set()
-            return super().submit(fn, task)
-
-        def stop(self):
-            """Do nothing: there is no process to stop."""
-
-    def fit(test, **options):
-        second.wait(60.0 if module.cache.compiled("follow") else 0.02)
-        order.append(f"{test.name} fitted")
-        return fabricated.result(measurement=test)
-
-    monkeypatch.setattr(batch_work, "fit", fit)
-    monkeypatch.setattr(module, "Processes", lambda *_: Slow(3))
-    for compiled in (False, True):
-        order.clear()
-        second.clear()
-        have = {"integrate", "follow"} if compiled else {"integrate"}
-        monkeypatch.setattr(module.cache, "compiled", lambda name="integrate", h=have: name in h)
-        again(executor=None, model="microscale", fresh=True)
-        assert order[0] == "a given"
-        assert (order[1] == "a fitted") != compiled
 
 
 # ------------------------------------------------------------------------- the page
@@ -702,47 +543,3 @@ def test_the_page_of_a_thousand_tests_is_small_and_needs_nothing_else(tmp_path):
     assert page.count("<tr>") == 1002
     assert "no &lt;height&gt; &amp; no width" in page
     assert page.count("<i>") >= 6000  # intervals
-
-
-def test_the_page_has_no_misfit_that_no_test_has(tmp_path):
-    cells = [fabricated.estimate("s1_kc", float(k)) for k in (1, 2, 40)]
-    rows = [
-        Row(f"t{i}", f"t{i}.csv", "ok", None, {"stress_strain": 0.01, "stress_time": None}, 1.0,
-            {"s1_kc": cell})
-        for i, cell in enumerate(cells)
-    ]  # fmt: skip
-    write_page(rows, tmp_path, "a batch")
-    page = (tmp_path / "summary.html").read_text(encoding="utf-8")
-    assert "misfit loop" in page
-    assert "misfit u(t)" not in page
-    assert "misfit σ(t)" not in page
-
-
-def test_of_very_many_tests_the_page_shows_some_and_all_that_failed(tmp_path):
-    rows = [Row(f"t{i}", "x.csv", "ok") for i in range(MOST_ON_PAGE + 5)]
-    rows.append(Row("last", "x.csv", "refused", "why"))
-    write_page(rows, tmp_path, "a batch")
-    page = (tmp_path / "summary.html").read_text(encoding="utf-8")
-    assert f"This page shows {MOST_ON_PAGE + 1} of them" in page
-    assert "last" in page
-
-
-def test_models_with_other_parameters_leave_cells_empty():
-    one = Row("a", "a.csv", "ok", parameters={"s1_k0": fabricated.estimate("s1_k0", 1.0)})
-    weak = fabricated.estimate("s1_kc", 2.0, state="weak")
-    other = Row("b", "b.csv", "ok", parameters={"s1_kc": weak})
-    first, second = table_rows([one, other])
-    assert list(first) == list(second)
-    assert first["s1_kc"] is None
-    assert second["s1_kc_state"] == "weak"
-
-
-def test_the_page_of_a_batch_shows_the_range_that_a_state_goes_by(tmp_path: Path) -> None:
-    """A wide range makes a parameter undetermined, however narrow its interval is."""
-    cell = fabricated.estimate(
-        "s1_kc", 2e5, stderr=1e3, ci95=(1.98e5, 2.02e5), state="not determined", range=(4e4, 7.1e5)
-    )
-    rows = [Row(name, f"{name}.csv", "ok", parameters={"s1_kc": cell}) for name in "ab"]
-    write_page(rows, tmp_path, "two tests")
-    page = (tmp_path / "summary.html").read_text()
-    assert "198.0 to 202.0; range 40 to 710" in page

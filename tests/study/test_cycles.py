@@ -106,34 +106,6 @@ def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path,
     assert "cycles.csv" not in {path.name for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("place", ["mine.txt", "cycle-2/mine.txt"])
-def test_what_foamfit_did_not_write_is_not_replaced(found, tmp_path, monkeypatch, place):
-    without_pictures(monkeypatch)
-    monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
-    monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
-    found.save(tmp_path / "out")
-    (tmp_path / "out" / place).write_text("mine")
-    with pytest.raises(ff.InputError, match="did not write"):
-        found.save(tmp_path / "out")
-    assert (tmp_path / "out" / place).read_text() == "mine"
-
-
-def test_the_picture_has_a_panel_for_each_parameter_and_a_row_for_each_cycle(found):
-    loops, *panels = (ax for ax in cycles_report.plot_cycles(found).axes if ax.axison)
-    key = [text.get_text() for text in loops.get_legend().get_texts()]
-    assert key == ["cycle 1", "cycle 2", "cycle 3"]
-    ends = [line.get_xdata()[-1] for line in loops.lines if line.get_label().startswith("cycle")]
-    assert ends == sorted(ends)  # each cycle starts where the previous one ended
-    titles = [ax.get_title().replace("\n", " ") for ax in panels]
-    assert titles[:3] == ["start strain (%)", "dissipated (kJ/m³)", "misfit of the loop (%)"]
-    assert [text.get_text() for text in panels[0].get_yticklabels()] == key
-    by_name = {ax.get_label(): ax for ax in panels}
-    assert by_name["s1_kh_plus"].get_title().endswith(" (MPa)")
-    low, high = by_name["s1_eps_a"].get_xlim()
-    assert low < 0.1 < 0.14 < high
-    assert cycles_report.plot_cycles(found, width="one").get_figwidth() == 3.25
-
-
 # -------------------------------------------------------------------------------- the command
 
 
@@ -147,12 +119,6 @@ def test_what_is_no_cycle_is_refused(record, tmp_path, cycle):
     assert result.exit_code == 1
     assert "must be a number from 1 up, several as 1,2,10, or all" in result.stderr
     assert not (tmp_path / "out").exists()
-
-
-def test_a_cycle_that_the_record_lacks_is_refused(record, tmp_path):
-    result = run("fit", record, "--cycle", "9", "--out", tmp_path / "out")
-    assert result.exit_code == 1
-    assert "cycle 9 cannot be taken: the file has cycles 1 to 3" in result.stderr
 
 
 def test_one_cycle_is_fitted_as_any_test(record, tmp_path, monkeypatch):
@@ -177,26 +143,11 @@ def test_all_cycles_are_fitted_in_turn(record, tmp_path, monkeypatch):
     assert json.loads((tmp_path / "out" / "cycles.json").read_text())["fitted"] == [1, 2, 3]
 
 
-def test_json_holds_every_cycle(record, tmp_path, monkeypatch):
-    without_pictures(monkeypatch)
-    monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
-    monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
-    words = ("--starts", 2, "--json", "--out", tmp_path / "out")
-    result = run("fit", record, "--cycle", "1,2", *words)
-    assert result.exit_code == 0
-    content = json.loads(result.stdout)
-    assert list(content["cycles"]) == ["1", "2"]
-    assert content["refused"] == {}
-    result = run("fit", record, "--cycle", "1,9", *words)
-    assert result.exit_code == 1
-    assert "9" in result.stderr
-
-
 # -------------------------------------------------------------------------------- measured foam
 
 
 @needs_data
-def test_three_cycles_of_a_shoe_foam(tmp_path):
+def test_two_cycles_of_a_shoe_foam(tmp_path):
     """Measurements: arXiv:2602.12694."""
     toml = tmp_path / "specimen.toml"
     toml.write_text(
@@ -206,9 +157,9 @@ def test_three_cycles_of_a_shoe_foam(tmp_path):
     record = DATA / "shoe-foam-twins" / "new-heel-comp-1_raw.txt"
     path = thinned(record, tmp_path, 2)
     options = {"model": "microscale", "relaxation": 1, "intervals": "local"}
-    found = ff.fit_cycles(path, toml, cycles=(1, 2, 4), **options)
+    found = ff.fit_cycles(path, toml, cycles=(1, 4), **options)
     assert found.recorded == (1, 2, 3, 4, 5, 6)
     strains = found.by_cycle["start_strain"]
     assert strains[1] == 0.0
-    assert 0.005 < strains[2] < strains[4] < 0.03
+    assert 0.01 < strains[4] < 0.03
     assert all(off < 0.0065 for off in found.by_cycle["misfit_stress_strain"])

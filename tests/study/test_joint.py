@@ -7,7 +7,6 @@ import re
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -16,14 +15,12 @@ from click.testing import CliRunner
 from scipy import stats
 
 import foamfit as ff
-from conftest import few_bytes, without_pictures
+from conftest import few_bytes, without_pictures, write_csv
 from foamfit.cli import main
 from foamfit.fitting.together import fit_linked
-from foamfit.report.folder import save_somewhere
 from foamfit.report.studies import joint as joint_report
-from foamfit.study import joint_fit, study_file
+from foamfit.study import joint_fit
 from foamfit.study.identified import read_source
-from foamfit.study.joint_fit import open_slope
 from foamfit.study.joint_result import parameter_of
 
 joint_module = importlib.import_module("foamfit.study.joint")  # the attribute is the function
@@ -33,6 +30,7 @@ SPRING = {
     "sigma_minus": 7e4, "spread_minus": 0.6,
 }  # fmt: skip
 NOISE = 400.0
+HEAD = "time (s),stress (Pa),displacement (mm)"
 
 
 def write_test(folder: Path, name: str, *, rate=0.1, seed=0, noise=NOISE, samples=101, **changes):
@@ -42,10 +40,7 @@ def write_test(folder: Path, name: str, *, rate=0.1, seed=0, noise=NOISE, sample
     strain = np.concatenate([up, up[::-1][1:]])
     time = np.arange(strain.size) * (up[1] / rate)
     stress = spring.stress(strain) + noise * np.random.default_rng(seed).standard_normal(time.size)
-    rows = zip(time, stress, 1e3 * HEIGHT * strain, strict=True)
-    lines = ["time (s),stress (Pa),displacement (mm)"]
-    lines += [f"{t:.9g},{s:.4f},{d:.7f}" for t, s, d in rows]
-    (folder / f"{name}.csv").write_text("\n".join(lines) + "\n")
+    write_csv(folder / f"{name}.csv", HEAD, time, stress, 1e3 * HEIGHT * strain)
 
 
 def write_study(folder: Path, parameters: str, more: str = "") -> Path:
@@ -142,6 +137,13 @@ def test_linked_values_are_one_value_bit_for_bit(found, tmp_path, monkeypatch):
     table = read.table().loc["t1"]
     assert table.loc["s1_kc", "value"] == found.parameters["s1_kc"].tests["t1"].value
     assert read_source(read).parameters == read_source(found).parameters
+    for one in content["parameters"].values():  # as an older version wrote it
+        for at in one.get("tests", {}).values():
+            del at["unit"], at["vary"], at["ci95_method"], at["range"], at["systematic"]
+    (tmp_path / "out" / "joint.json").write_text(json.dumps(content))
+    older = ff.load(tmp_path / "out").table()
+    columns = ["value", "stderr", "ci95_lo", "unit", "state"]
+    pd.testing.assert_frame_equal(older[columns], found.table()[columns])
 
 
 def test_joint_json_says_everything(found):
@@ -171,25 +173,6 @@ def test_joint_json_says_everything(found):
     assert content["statistics"]["n_vary"] == 4 + 2 + 3 + 3
 
 
-def test_joint_json_tells_the_noise_by_which_each_test_is_weighted(found, tmp_path, monkeypatch):
-    without_pictures(monkeypatch)
-    found.save(tmp_path / "out", jobs=1, report=False)
-    content = json.loads((tmp_path / "out" / "joint.json").read_text())
-    for name, test in content["tests"].items():
-        (curve, level), *more = test["noise"].items()
-        assert curve == "stress_strain"
-        assert not more
-        assert (level["sigma"], level["given"], level["how"]) == (NOISE, True, "given")
-        assert (level["time"], level["scale"]) == (1.0, NOISE)
-        single = json.loads((tmp_path / "out" / name / "fit.json").read_text())
-        assert level.keys() == single["noise"][curve].keys()
-        assert level["range"] == single["noise"][curve]["range"]
-    # a prediction subtracts this noise from the misfit of each fitted test
-    wanted = [NOISE / one["noise"]["stress_strain"]["range"] for one in content["tests"].values()]
-    source = read_source(tmp_path / "out")
-    assert [one.noise for one in source.misses["stress"]] == pytest.approx(wanted)
-
-
 def test_evidence_is_for_the_law_that_there_is(found):
     scores = {one.kind: one.bic for one in found.evidence}
     assert scores["log rate"] < scores["shared"] - 10.0
@@ -201,7 +184,7 @@ def test_what_noise_alone_is_left_of_has_no_range(found):
     assert found.fit.ranges == {}
     content = found.to_json_dict()["parameters"]
     assert content["s1_k0"]["range"] is None
-    assert content["s1_sigma_plus"]["b_range"] is None
+    assert content["s1_sigma_plus"].get("b_range") is None
 
 
 @pytest.fixture(scope="module")
@@ -281,41 +264,6 @@ def test_a_law_of_rate_is_no_kind_where_the_rates_span_too_little(tmp_path):
     assert told.startswith("s1_k0 (power rate): its own values in the tests, at 0.0985 to 0.102")
 
 
-@pytest.mark.parametrize(
-    ("x", "half"),
-    [
-        (np.log([0.1, 0.3, 1.0, 3.0]), (0.0, 0.05)),  # a span of rates
-        (np.log([0.1, 0.101, 0.102, 0.103]), (1.0, 10.0)),  # repeats
-        (np.zeros(4), (np.inf, np.inf)),
-        (np.array([0.0, 1.0]), (np.inf, np.inf)),  # two points lie on a line: no scatter
-    ],
-)
-def test_how_open_a_slope_is_says_the_scatter_of_the_tests_about_it(x, half):
-    values = 5e5 * np.exp(0.2 * x + 0.02 * np.array([1.0, -1.0, 0.5, -0.5])[: x.size])
-    problem = SimpleNamespace(free=lambda: ("s1_k0",))
-    fit = SimpleNamespace(
-        problems=[problem] * x.size, links=SimpleNamespace(log_rates=x),
-        value=lambda name: values.tolist(),
-    )  # fmt: skip
-    low, high = half
-    assert low <= open_slope(fit, "s1_k0") <= high
-
-
-def test_a_kind_that_no_test_can_be_simulated_with_is_not_chosen(folder, monkeypatch):
-    """Common values of a law may form an inadmissible spring: limits depend on other parameters."""
-    real = joint_fit.fit_linked
-
-    def fit_linked(problems, links, starts, **options):
-        if links.kind("s1_sigma_plus") == "log rate":
-            raise ff.SimulationError("no start of the fit can be simulated")
-        return real(problems, links, starts, **options)
-
-    monkeypatch.setattr(joint_fit, "fit_linked", fit_linked)
-    chosen = ff.joint(write_study(folder, 's1_sigma_plus = "auto"\ns1_kc = "own"' + SHARED), jobs=1)
-    assert chosen.parameters["s1_sigma_plus"].kind == "power rate"
-    assert "log rate" not in {one.kind for one in chosen.evidence}
-
-
 def test_what_goes_to_other_processes_gives_the_same_numbers(folder, found, monkeypatch):
     """Arguments and results pass through `pickle` on their way to and from a process."""
     sent = []
@@ -349,7 +297,8 @@ def test_a_noisy_test_does_not_dominate(tmp_path):
     study.write_text(study.read_text().replace("[parameters]",
                      '[specimens]\nt3 = "noisy.toml"\n[parameters]'))  # fmt: skip
     result = ff.joint(study, jobs=1)
-    assert result.shares == pytest.approx([0.25] * 4, abs=0.06)
+    shares = [one.chi2_share for one in result.tests.values()]
+    assert shares == pytest.approx([0.25] * 4, abs=0.06)
     one = result.parameters["s1_k0"]
     assert abs(one.value - SPRING["k0"]) < 4.0 * one.stderr
 
@@ -373,10 +322,7 @@ def test_drives_and_noise_mix(tmp_path):
     common = '[specimen]\nheight = "1.19 mm"\narea = "19.635 mm^2"\n'
     for name, (t, stress, moved) in loops.items():
         stress = stress + 5e3 * rng.standard_normal(t.size)
-        rows = zip(t, stress, 1e3 * moved, strict=True)
-        lines = ["time (s),stress (Pa),displacement (mm)", *(f"{a:.9g},{b:.3f},{c:.9f}"
-                                                             for a, b, c in rows)]  # fmt: skip
-        (tmp_path / f"{name}.csv").write_text("\n".join(lines))
+        write_csv(tmp_path / f"{name}.csv", HEAD, t, stress, 1e3 * moved)
         striker = '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n' if name == "fast" else ""
         (tmp_path / f"{name}.toml").write_text(common + striker)
     names = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
@@ -456,34 +402,6 @@ def test_bad_studies_are_refused_in_one_sentence(folder, tmp_path, parameters, m
     assert not (tmp_path / "out").exists()
 
 
-def test_a_study_is_read_once(folder, tmp_path, monkeypatch):
-    real, read = study_file.load_toml, list[Path]()
-
-    def load_toml(path, *words):
-        read.append(path)
-        return real(path, *words)
-
-    monkeypatch.setattr(study_file, "load_toml", load_toml)
-    monkeypatch.setattr(joint_module, "_read", lambda *_: (_ for _ in ()).throw(ff.InputError("x")))
-    study = write_study(folder, 's1_k0 = "shared"')
-    assert run("joint", study, "--out", tmp_path / "out").stderr == "foamfit: x\n"
-    assert read == [study]
-
-
-def test_what_the_folders_need_is_imported_beside_the_fit(folder, tmp_path, monkeypatch):
-    """Preload only where other processes draw reports: not for one job or without reports."""
-    begun = list[tuple[str, ...]]()
-    monkeypatch.setattr("foamfit.study.processes.prepare", begun.append)
-    monkeypatch.setattr(joint_module, "_read", lambda *_: (_ for _ in ()).throw(ff.InputError("x")))
-    words = ["joint", write_study(folder, 's1_k0 = "shared"'), "--out", tmp_path / "out"]
-    for more in (["--jobs", "1"], ["--jobs", "2", "--no-report"]):
-        assert run(*words, *more).exit_code == 1
-    assert begun == []
-    assert run(*words, "--jobs", "2").exit_code == 1
-    (preload,) = begun
-    assert "matplotlib.backends.backend_agg" in preload
-
-
 def test_a_law_of_rate_needs_two_rates(tmp_path):
     for i in range(2):
         write_test(tmp_path, f"t{i}", seed=i)
@@ -492,21 +410,6 @@ def test_a_law_of_rate_needs_two_rates(tmp_path):
         ff.InputError, match=r'"log rate" needs tests at two or more rates, and all'
     ):
         ff.joint(study)
-
-
-def test_a_full_disk_leaves_what_was_there(found, tmp_path, monkeypatch):
-    without_pictures(monkeypatch)
-    found.save(tmp_path / "out", jobs=1, report=False)
-    before = (tmp_path / "out" / "joint.json").read_text()
-
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("foamfit.report.studies.joint.write_result", full)
-    with pytest.raises(ff.InputError, match="No space left on device; choose another folder"):
-        found.save(tmp_path / "out", jobs=1, report=False)
-    assert (tmp_path / "out" / "joint.json").read_text() == before
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 def test_one_number_may_be_all_that_is_fitted(tmp_path):
@@ -530,24 +433,6 @@ def test_a_common_value_that_is_open_by_any_orders_of_magnitude_is_not_determine
     assert np.isfinite(one.value)
 
 
-def test_a_test_that_says_nothing_of_a_parameter_has_no_part_in_its_scatter(tmp_path, monkeypatch):
-    """Log kc of a test too weak to determine kc would have a standard error in the thousands."""
-    for i, kc in enumerate((3.6e5, 4e5, 4.5e5)):
-        write_test(tmp_path, f"t{i}", seed=i, kc=kc)
-    study = write_study(tmp_path, 's1_k0 = "shared"\ns1_kc = "scatter"' + SHARED)
-    real = joint_fit.JointPoint.of_logarithms
-
-    def nothing(self, name):
-        matrix, bread = real(self, name)
-        matrix[2, 2], bread[2, 2] = 1e6, 1e6
-        return matrix, bread
-
-    monkeypatch.setattr(joint_fit.JointPoint, "of_logarithms", nothing)
-    kc = ff.joint(study, jobs=1).parameters["s1_kc"]
-    assert "common value of 2 tests" in kc.why
-    assert kc.value == pytest.approx(3.8e5, rel=0.05)
-
-
 def test_joint_json_has_how_parameters_vary_together(found):
     said = found.to_json_dict()["specimens"]
     assert said["names"] == ["s1_kc", "s1_sigma_minus"]
@@ -555,20 +440,3 @@ def test_joint_json_has_how_parameters_vary_together(found):
     assert np.diag(matrix) == pytest.approx(1.0)
     assert read_source(found).changing == tuple(said["names"])
     np.testing.assert_allclose(read_source(found).together, matrix)
-
-
-def test_a_report_that_fails_leaves_the_numbers(found, tmp_path, monkeypatch):
-    without_pictures(monkeypatch)
-
-    def fails(*_, **__):
-        raise OverflowError("math range error")
-
-    monkeypatch.setattr("foamfit.report.studies.joint.plot_joint", fails)
-    with pytest.raises(OverflowError, match="math range error"):
-        save_somewhere(found.save, tmp_path / "out", jobs=1)
-    content = json.loads((tmp_path / "out" / "joint.json").read_text())
-    assert content["parameters"]["s1_kc"]["scatter"] == found.parameters["s1_kc"].scatter
-    monkeypatch.undo()
-    without_pictures(monkeypatch)
-    monkeypatch.setattr(joint_report.figures, "write_both", few_bytes)
-    found.save(tmp_path / "out", jobs=1)  # and may be overwritten

@@ -8,18 +8,14 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import EXPERIMENTS, without_pictures
-from foamfit.fitting.nuisance import names_of
-from foamfit.fitting.problem import make_problem
+from conftest import EXPERIMENTS
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.identified import read_source
-from inline import Inline
 
 sys.path.insert(0, str(EXPERIMENTS / "recovery"))
 import rig
@@ -90,20 +86,6 @@ def test_each_test_has_its_own_contact_zero_and_striker(together):
             assert one["ci95"][0] < one["value"] < one["ci95"][1]
 
 
-def test_the_folder_of_each_test_has_its_own_numbers(together, tmp_path, monkeypatch):
-    _, _, found = together
-    without_pictures(monkeypatch)
-    found.save(tmp_path / "out", jobs=1)
-    content = json.loads((tmp_path / "out" / "joint.json").read_text())
-    for test in ("t0", "t2"):
-        single = json.loads((tmp_path / "out" / test / "fit.json").read_text())["parameters"]
-        names = [name for name in single if name in NUISANCE]
-        assert ("velocity" in names) == (test == "t2")
-        for name in names:
-            assert single[name]["value"] == content["parameters"][name]["tests"][test]["value"]
-            assert single[name]["value"] == content["tests"][test]["values"][name]
-
-
 def test_intervals_of_shared_values_hold_the_truth(together, tmp_path):
     """Over 20 draws, 93 % do (147 of 158). Of the 16 intervals here, one may miss."""
     inside, off = [], []
@@ -114,20 +96,6 @@ def test_intervals_of_shared_values_hold_the_truth(together, tmp_path):
             off.append(abs(one.value - truth) / one.stderr)
     assert np.mean(inside) > 0.9
     assert max(off) < 4.0
-
-
-def test_a_value_that_the_study_holds_is_that_of_each_file(together):
-    study = together[0] / "held.toml"
-    study.write_text(
-        'tests = ["t0.csv", "t1.csv"]\nmodel = "bistable"\nstarts = 2\n'
-        "[parameters]\nstress_zero = 0\n"
-    )
-    found = ff.joint(study, jobs=1)
-    held = found.parameters["stress_zero"]
-    assert (held.kind, held.value) == ("fixed", 0.0)
-    # Rows before contact show another value.
-    assert found.estimates(0)["stress_zero"].value == 0.0
-    assert found.problems[0].measurement.origins["stress_zero"] != 0.0
 
 
 # ------------------------------------------------------------------------------- predictions
@@ -200,52 +168,17 @@ def test_a_joint_fit_weighs_each_driving_motion(tmp_path, monkeypatch):
         f"[parameters]{shared}\n"
     )
     found = ff.joint(tmp_path / "study.toml", jobs=1)
-    whole = [problem.objective.weighing for problem in found.problems]
+    problems = found.fit.found.problems
+    whole = [problem.objective.weighing for problem in problems]
     assert all(one is not None for one in whole)
     # Sharing values raises chi-square by no more than noise does, as both use the same weights.
     statistics = found.statistics
     assert 0.0 < statistics["chisqr"] - statistics["chisqr_alone"] < 40.0
-    held = found.problems[0].holding("s1_k0", 1.0)
+    held = problems[0].holding("s1_k0", 1.0)
     assert held.objective.weighing is whole[0]
 
 
-def test_profiles_agree_with_the_local_intervals(together, tmp_path):
-    folder, _, _ = together
-    (slow,) = write_slow(tmp_path, (30,), law="bistable", rows=300)
-    for path in (folder / "t2.csv", slow):
-        test = ff.read_test(path)
-        local = ff.fit(test, intervals="local", starts=2).parameters
-        other = ff.fit(test, intervals="profile", starts=2).parameters
-        wider = [
-            np.ptp(other[name].ci95) / np.ptp(local[name].ci95)
-            for name in local
-            if local[name].ci95 is not None and other[name].ci95 is not None
-        ]
-        assert len(wider) >= 6
-        assert 0.7 < np.median(wider) < 1.4
-
-
 # ------------------------------------------------------------------------------- batch, page, auto
-
-
-def test_a_batch_fixes_and_varies_what_a_record_does_not_say(together, tmp_path):
-    folder, _, _ = together
-    quick = {"starts": 2, "intervals": "local", "report": False, "executor": Inline()}
-    fixed = {"stress_zero": 0.0}
-    frame = ff.batch(
-        [folder / "t1.csv", folder / "t2.csv"], out=tmp_path / "out", fix=fixed,
-        vary=["velocity"], **quick,
-    ).set_index("test")  # fmt: skip
-    assert frame.loc["t2", "velocity_stderr"] > 0.0
-    assert frame.loc["t2", ["stress_zero", "stress_zero_state"]].tolist() == [0.0, "fixed"]
-    assert np.all(frame["contact_time_stderr"] > 0.0)
-    places = [frame.columns.get_loc(name) for name in ("s1_eta", "displacement_zero", "velocity")]
-    assert places == sorted(places)  # after those of the springs, in a fixed order
-    with pytest.raises(ff.InputError, match=r"its parameters are s1_k0, .*, contact_time, "):
-        ff.batch(folder, out=tmp_path / "no", fix={"contact": 0.0}, **quick)
-    with pytest.raises(ff.InputError, match="'stress_zero' is not one of the model"):
-        ff.batch(folder, out=tmp_path / "no", fix=fixed, drive="stress", **quick)
-    assert not (tmp_path / "no").exists()
 
 
 def test_what_nothing_shows_cannot_vary(together):
@@ -254,76 +187,3 @@ def test_what_nothing_shows_cannot_vary(together):
     params["acceleration_zero"].set(vary=True)
     with pytest.raises(ff.InputError, match="'acceleration_zero' cannot vary"):
         ff.fit(test, params=params)
-
-
-def test_a_fit_of_a_record_from_before_contact_is_drawn_on_the_page(fitted):
-    pytest.importorskip("panel")
-    from foamfit.page.turning import Turning
-
-    told = {name: one.value for name, one in fitted.parameters.items()}
-    turning = Turning(fitted.measurement, "bistable", told)
-    assert not {row.name for row in turning.rows} & NUISANCE.keys()  # without controls on the page
-    drawn = turning.turn({})
-    _, stress = drawn.curves["stress_time"]
-    np.testing.assert_allclose(stress, fitted.curves.stress, atol=1e-6 * np.ptp(stress))
-    assert drawn.misfit["stress_time"] == pytest.approx(fitted.misfit["stress_time"], rel=1e-3)
-
-
-def test_richer_models_start_from_the_contact_that_simpler_ones_found(fitted):
-    from foamfit.auto import _carry
-    from foamfit.springs.model import Model
-
-    model = Model.parse("linear+bistable")
-    params = ff.make_params(fitted.measurement, model)
-    _carry(params, model, [SimpleNamespace(result=fitted, chisqr=1.0)])
-    for name in ("contact_time", "displacement_zero"):
-        assert params[name].value == fitted.params[name].value
-        assert params[name].min < params[name].value < params[name].max
-
-
-# ------------------------------------------------------------------------------- two clocks
-
-
-def write_two_clocks(folder: Path, seed: int, late: float) -> dict[str, float]:
-    """Write a force at 1 MHz and a camera at 50 kHz whose clock lags by `late` seconds."""
-    setup = rig.Impact(samples=250)
-    made = rig.drawn_impact(setup, np.random.default_rng([3, 1])).rig
-    course = made.run(0.0, 100.0 * made.heights[0] / made.velocity)
-    noise = np.random.default_rng(seed)
-    time = np.arange(-0.3 * course.end, 1.2 * course.end, 1e-6)
-    frames = np.arange(-0.2 * course.end, 1.1 * course.end, 20e-6)
-    force, moved = course.stress(time) * made.area, course.top(frames, gauge=False)
-    force = force + 0.005 * np.ptp(force) * noise.standard_normal(force.size)
-    moved = moved + 0.005 * np.ptp(moved) * noise.standard_normal(moved.size)
-    for name, head, table in (
-        ("test.csv", "time (us),force (N)", (1e6 * time, force)),
-        ("camera.csv", "time (us),displacement (um)", (1e6 * (frames - late), 1e6 * moved)),
-    ):
-        np.savetxt(
-            folder / name, np.column_stack(table), delimiter=",", header=head, comments="",
-            fmt="%.9g",
-        )  # fmt: skip
-    (folder / "test.toml").write_text(
-        f'[specimen]\nheight = "{made.heights[0]} m"\narea = "{made.area} m^2"\n'
-        f'[striker]\nmass = "{made.mass} kg"\nvelocity = "{made.velocity} m/s"\n'
-        '[motion]\nfile = "camera.csv"\ndelay = "0 ± 50 us"\n'
-    )
-    return {f"s1_{name}": getattr(made.springs[0], name) for name in ("k0", "eps_a", "eps_c")}
-
-
-def test_a_delay_with_a_spread_is_fitted_as_a_time_shift(tmp_path):
-    truth = write_two_clocks(tmp_path, 0, 30e-6)
-    test = ff.read_test(tmp_path / "test.csv")
-    assert "time_shift" in ff.make_params(test)
-    result = ff.fit(test, starts=2, intervals="local")
-    shift = result.parameters["time_shift"]
-    # time of the force = time of the motion + 30 µs, so the motion is 30 µs early
-    assert abs(shift.value + 30e-6) < 2.0 * shift.stderr
-    assert shift.stderr < 10e-6  # far below the standard deviation of the prior
-    for name, value in truth.items():
-        one = result.parameters[name]
-        assert abs(one.value - value) < 3.0 * one.stderr
-    problem = make_problem(test, "bistable", None, None, None, interior_mass=False)
-    assert problem.objective.nuisance == names_of("impact", time_shift=True)
-    prior = {one.name: one.sigma for one in problem.objective.priors}["time_shift"]
-    assert prior == pytest.approx(50e-6)

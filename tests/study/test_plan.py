@@ -10,9 +10,10 @@ import pytest
 from click.testing import CliRunner
 
 import foamfit as ff
+from conftest import write_csv
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
-from foamfit.data.rig import Candidate, candidates, read_rig
+from foamfit.data.rig import candidates, read_rig
 from foamfit.errors import InputError
 from foamfit.study.study_file import read_study
 
@@ -110,8 +111,7 @@ def test_expected_widths_are_those_of_a_joint_fit_with_the_advised_test(of_publi
         channels = [time * 1e3, seen.base_stress / 1e6, seen.displacement[-1] * 1e3]
         noise = [0.0, sizes["stress"] / 1e6, sizes["displacement"] * 1e3]
         rows = np.transpose(channels) + rng.standard_normal((time.size, 3)) * noise
-        head = "time (ms),stress (MPa),displacement (mm)"
-        np.savetxt(tmp_path / f"{name}.csv", rows, "%.9g", ",", header=head, comments="")
+        write_csv(tmp_path / f"{name}.csv", "time (ms),stress (MPa),displacement (mm)", rows)
         (tmp_path / f"{name}.toml").write_text(
             '[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n'
             f'[striker]\nmass = "7 g"\nvelocity = "{speed} m/s"\n'
@@ -187,20 +187,6 @@ def test_files_and_terminal(soft, tmp_path, monkeypatch):
     assert set(study.kinds.values()) == {"shared"}
 
 
-def test_the_table_has_a_row_for_each_test(planned):
-    table = planned.table()
-    assert len(table) == len(planned.outcomes)
-    assert table["s1_kc_state"].isin(["determined", "weak", "not determined"]).all()
-
-
-def test_another_folder_is_not_replaced(tmp_path, planned):
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine/notes.txt").write_text("keep", encoding="utf-8")
-    with pytest.raises(InputError, match="mine"):
-        planned.save(tmp_path / "mine")
-    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
-
-
 def slow_test() -> Measurement:
     """A triangular loop of a microscale spring to a strain of 0.5 in 2 s, with 1 kPa of noise."""
     rng, time = np.random.default_rng(0), np.linspace(0.0, 2.0, 401)
@@ -224,15 +210,6 @@ def test_a_slow_test_is_followed_by_cycles_and_holds():
     slow = [one for one in found.outcomes if one.candidate.rate < 0.1]
     share = {id(one): one.expected["s1_tau1"].share for one in (*fast, *slow)}
     assert min(share[id(one)] for one in fast) < min(share[id(one)] for one in slow)
-
-
-def test_the_motion_of_a_candidate_rises_holds_and_returns():
-    one = Candidate("displacement", strain=0.4, rate=0.2, cycles=2, hold=3.0)
-    time, moved = one.motion(10e-3)
-    assert time[-1] == pytest.approx(2 * (2.0 + 3.0 + 2.0))
-    assert moved.max() == pytest.approx(4e-3)
-    held = time[np.isclose(moved, 4e-3, rtol=1e-9)]
-    assert np.ptp(held[held < 6.0]) == pytest.approx(3.0, abs=0.1)
 
 
 def test_two_springs_with_a_camera_have_candidates_with_an_interior_displacement(soft, tmp_path):
@@ -305,15 +282,6 @@ def test_what_the_rig_does_not_state_is_taken_from_the_record_and_said():
     assert rig.sampling == pytest.approx(1e5)
     assert rig.noise == {"stress": 1e4, "displacement": 1e-6}
     assert len(rig.notes) == 5
-
-
-def test_what_a_contradictory_record_promises_is_capped():
-    from foamfit.report.studies.plan import Expected
-
-    one = Expected(1.0, (0.9, 1.1), 0.1, "determined", 0.9)
-    assert (one.capped().state, one.capped().chance, one.capped().width) == ("weak", 0.0, 1.0)
-    other = Expected(1.0, (0.9, 1.1), 5.0, "not determined", 0.1)
-    assert other.capped().state == "not determined"
 
 
 def test_where_the_law_errs_ranges_are_expected_and_no_test_removes_them(tmp_path):

@@ -262,8 +262,8 @@ def test_a_joint_impact_determines_nothing_that_would_move(tmp_path: Path) -> No
     assert [text.split(":")[0] for text in found.warnings[:2]] == ["Check test-2", "Check test-3"]
     for name, one in found.parameters.items():
         assert one.kind == "own" or one.state != "determined", name
-    for t, seed in enumerate((2, 3)):
-        own = found.estimates(t)
+    for seed in (2, 3):
+        own = found.results[f"test-{seed}"].parameters
         assert own["s1_k0"].state == "weak"
         assert "contradict each other" in own["s1_k0"].why
         assert far(SimpleNamespace(parameters=own), record_of(seed).truth) == []

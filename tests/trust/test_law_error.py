@@ -253,7 +253,7 @@ def test_the_result_says_what_was_decided(tmp_path):
     kept = load_result(folder)["parameters"]["s1_kc"]
     assert kept["range"] == pytest.approx(result.parameters["s1_kc"].range)
     header = (folder / "parameters.csv").read_text().splitlines()[0]
-    assert header.split(",")[3:7] == ["ci95_low", "ci95_high", "range_low", "range_high"]
+    assert header.split(",")[3:7] == ["ci95_lo", "ci95_hi", "range_lo", "range_hi"]
     report = (folder / "report.html").read_text()
     assert all(line.replace("'", "&#39;") in report for line in RULE)
 

@@ -34,9 +34,9 @@ from foamfit.report.figures import BLUE, FITTED, SEEN, image
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import environment, words
 from foamfit.results import Fit, law_in_words, plain
-from foamfit.saved import SavedJoint, load
 from foamfit.study.identified import HasContent, read_source
 from foamfit.study.joint_result import JointResult
+from foamfit.study.saved import load
 from foamfit.text import percent, significant
 
 if TYPE_CHECKING:
@@ -100,8 +100,6 @@ def read_records(result: object) -> list[Record]:
         path = Path(result)
         return read_records(load(path if path.is_dir() else path.parent))
     if isinstance(result, JointResult):
-        return [Record.of(one()) for one in result.test_fits()]
-    if isinstance(result, SavedJoint):
         return [Record.of(one) for one in result.results.values()]
     if isinstance(result, Fit):
         return [Record.of(result)]

@@ -26,7 +26,8 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Specimen
 from foamfit.solve.simulation import Response, simulate
 from foamfit.springs.chain import DisplacementDrive
-from foamfit.study.identified import Population, Source
+from foamfit.study.identified import Source
+from foamfit.study.population import Population
 
 POINTS = 100  # of a curve in a card
 # A curve ends at the strain END, or where its stress exceeds MOST times the largest stress within

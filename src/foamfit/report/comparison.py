@@ -199,7 +199,8 @@ def side_of(result: Result) -> Side:
         given = result if isinstance(result, Mapping) else load_result(result)
     with reading(str(result) if isinstance(result, str | Path) else "the result"):
         model, about = Model.of_result(given), (given["test"], given["drive"], given["status"])
-        estimates = {n: build(ParameterEstimate, p, {}) for n, p in given["parameters"].items()}
+        every = given["parameters"].items()
+        estimates = {n: build(ParameterEstimate, {**p, "state": p["state"]}, {}) for n, p in every}
         known = given.get("correlation") or {"names": (), "matrix": ()}
         numbers = _with_errors(estimates, known["names"], known["matrix"])
         label = f"{about[0]}: {law_in_words(model.name, model.relaxation)}, {about[1]} drive"

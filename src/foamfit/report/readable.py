@@ -96,7 +96,7 @@ def readable(name: str, p: ParameterEstimate, given: tuple[float, str] | None = 
         ends = (float(f"{bound / factor + 0.0:.2g}") for bound in p.range)
         span = " to ".join(f"{end:g}".replace("-", "−") for end in ends)
     unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
-    scale = f"{p.systematic / factor:.2g}" if p.systematic > 0.0 else ""
+    scale = f"{p.systematic / factor:.2g}" if p.systematic else ""
     rest = (p.state, p.why, p.ci95_method or "", span, scale)
     return Readable(name, symbol(name), shown, stderr, interval, unit, *rest)
 

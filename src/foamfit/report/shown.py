@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-Joint = Any  # `foamfit.study.joint_result.JointResult`, or `foamfit.saved.SavedJoint` from a file
+Joint = Any  # `foamfit.study.joint_result.JointResult`
 
 
 def brief(title: str, line: str, rows: Sequence[Readable], html: bool, table: Any = None) -> str:
@@ -62,7 +62,7 @@ class JointViews(Shown):
         for test in self.tests:
             own = {n: p for n, p in self.parameters.items() if p.tests and test in p.tests}
             kinds = {name: p.kind for name, p in own.items()}
-            each = {name: p.estimate(test) for name, p in own.items()}
+            each = {name: p.in_test(test) for name, p in own.items()}
             frames[test] = frame(each, kind=kinds, scatter={}, b={})
         return stacked(frames, "test")
 
@@ -71,5 +71,5 @@ class JointViews(Shown):
         line = f"{self.model} · {counted(len(self.tests), 'test')} together · status {self.status}"
         every = self.parameters.items()
         common = {n: p for n, p in every if p.kind != "fixed" and n not in NUISANCE}
-        rows = [readable(name, p.estimate()) for name, p in common.items()]
+        rows = [readable(name, p) for name, p in common.items()]
         return brief(self.name, line, rows, html)

@@ -200,7 +200,7 @@ def _moved(result: Fit) -> tuple[str, float] | None:
     if (budget := result.budget) is None or not budget.contributions:
         return None
     shares = {
-        name: result.parameters[name].systematic / budget.scales[name]
+        name: (result.parameters[name].systematic or 0.0) / budget.scales[name]
         for name in budget.contributions
     }
     most = max(shares, key=shares.__getitem__)

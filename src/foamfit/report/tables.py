@@ -163,10 +163,8 @@ def _rows(parameters: Mapping[str, Any], more: Mapping[str, Any]) -> Iterator[di
 def numbers_of(p: Any) -> dict[str, float | None]:
     """Return the numbers of a parameter by column name, in SI; None for missing values."""
     (low, high), (least, most) = p.ci95 or (None, None), p.range or (None, None)
-    ends = {"ci95_low": low, "ci95_high": high, "range_low": least, "range_high": most}
-    # A joint fit does not compute `systematic`.
-    ends |= {"systematic": getattr(p, "systematic", None)}
-    return {"value": p.value, "stderr": p.stderr, **ends}
+    ends = {"ci95_lo": low, "ci95_hi": high, "range_lo": least, "range_hi": most}
+    return {"value": p.value, "stderr": p.stderr, **ends, "systematic": p.systematic}
 
 
 def stacked(frames: Mapping[Any, pd.DataFrame], name: str) -> pd.DataFrame:

@@ -1,6 +1,7 @@
-"""Several tests or cycles, fitted separately or together.
+"""Several tests or cycles, fitted separately or together, and results read from their folders.
 
 Start with `cycles` (the cycles of one record), `batch` (many separate tests) and `joint` (from a
 study file, `study_file`, to a result). `joint_fit` has the fit of several tests with linked
-parameters, `predict` the prediction of another test, and `processes` a process pool.
+parameters, `predict` the prediction of another test from a `population`, `plan` the choice of the
+next test, `saved` the reader of result folders, and `processes` a process pool.
 """

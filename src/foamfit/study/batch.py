@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Unpack
 
 from foamfit.data.toml_file import motion_file, toml_beside
-from foamfit.errors import InputError
+from foamfit.errors import InputError, check_whole
 from foamfit.files import is_left, read_whole, reason, sweep
 from foamfit.fitting import nuisance
 from foamfit.fitting.problem import check_fixed_and_varied
@@ -27,16 +27,8 @@ from foamfit.report.studies.batch import Row
 from foamfit.results import law_in_words
 from foamfit.solve import cache, precompile
 from foamfit.springs.model import Model, with_options
-from foamfit.study.batch_work import (
-    Outcome,
-    Recipe,
-    Task,
-    fingerprint,
-    put,
-    stored,
-    work,
-)
-from foamfit.study.processes import FITS, PAGES, EndedError, Processes, check_jobs, cores
+from foamfit.study.batch_work import Outcome, Recipe, Task, fingerprint, put, stored, work
+from foamfit.study.processes import FITS, PAGES, EndedError, Processes, cores
 from foamfit.study.test_files import find_tests
 from foamfit.terminal import without_ctrl_c
 from foamfit.text import counted
@@ -277,7 +269,8 @@ def run(
     """Fit the tests as `batch` does, and return the finished `Batch`."""
     options = Options.of("batch", recipe.options)
     recipe = replace(recipe, model=_checked(recipe.model, options), options=vars(options))
-    check_jobs(jobs)
+    if jobs is not None:
+        check_whole("jobs", jobs, 1)
     if recipe.cycles is not None and recipe.history is not None:
         raise InputError("give either cycle or cycles, not both")
     if jobs is not None and executor is not None:

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from foamfit.api import fit
-from foamfit.codec import build, encode
+from foamfit.codec import build, plain
 from foamfit.data.csv_file import read_test
 from foamfit.data.toml_file import motion_file
 from foamfit.errors import InputError, SimulationError
@@ -133,7 +133,7 @@ def work(task: Task) -> Outcome:
             "fingerprint": task.fingerprint,
             "pages": task.recipe.pages,
             "figure_width": inches(task.recipe.width),
-            "rows": encode(rows, {}),
+            "rows": plain(rows, {}),
         }
 
         def fill(folder: Path) -> None:

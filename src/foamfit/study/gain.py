@@ -293,10 +293,8 @@ class Target:
         parts = objective.by_curve(problem.slopes(values, known.names) * known.sizes)
         by = {curve: part.T / objective.factor(curve) for curve, part in parts.items()}
         stress, moved = curves["stress_time"], curves["displacement_time"]
-        by_stress, by_motion = (
-            by["stress_time"],
-            by.get("displacement_time", 0.0 * by["stress_time"]),
-        )
+        by_stress = by["stress_time"]
+        by_motion = by.get("displacement_time", 0.0 * by_stress)
         if name == "peak_force":
             at = int(np.argmax(stress))
             return float(stress[at]) * specimen.area, by_stress[:, at] * specimen.area
@@ -313,11 +311,13 @@ class Target:
         noise, law = covariance(known, seen, 1.0 / NOTHING**2)
         total = noise + law / NORMAL**2
         variance = np.einsum("di,dij,dj->d", self.slopes, total, self.slopes)
-        return math.sqrt(max(float(np.nanmean(variance)), 0.0)) / abs(
-            float(np.nanmedian(self.values))
-        )
+        return math.sqrt(max(float(np.nanmean(variance)), 0.0)) / abs(self.middle)
+
+    @property
+    def middle(self) -> float:
+        """Median of the quantity over the draws, SI."""
+        return float(np.nanmedian(self.values))
 
     def shown(self, known: Known) -> Quantity:
         """Return the quantity as it is known now."""
-        middle = float(np.nanmedian(self.values))
-        return Quantity(self.text, self.unit, middle, self.error(known, []))
+        return Quantity(self.text, self.unit, self.middle, self.error(known, []))

@@ -1,37 +1,30 @@
-"""The law and parameters of a result, and the parameters that it predicts for another test.
+"""The law and parameters of a result, read from fit.json or joint.json.
 
-They are read from fit.json or joint.json. For a result in memory the content of its file is used,
-so that both give the same numbers. The uncertainty of the parameters is a covariance; parameters
-that vary between specimens (kinds "scatter" and "own") are drawn.
+For a result in memory the content of its file is used, so that both give the same numbers.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.codec import build
-from foamfit.data.measurement import Specimen
 from foamfit.errors import InputError
-from foamfit.fitting.box import is_logarithmic
-from foamfit.fitting.links import KINDS, RATES, factor
+from foamfit.fitting.links import KINDS, RATES
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.options import DRIVES
+from foamfit.parts import ParameterEstimate
 from foamfit.report.folder import load_result
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, split_name
-from foamfit.trust.scatter import correlation
 
 NORMAL = 1.959964  # half the 95 % interval of a normal distribution, in standard deviations
-Pair = tuple[float, float]
 
 
 class HasContent(Protocol):
@@ -39,51 +32,6 @@ class HasContent(Protocol):
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of the result file."""
-
-
-@dataclass(frozen=True)
-class Identified:
-    """One parameter of a result, SI.
-
-    `kind` is one of `links.KINDS` or "fixed"; free parameters of a single test are "shared".
-    `tests` are the values of an own or scattering parameter in the tests, and `rates` the rates of
-    these tests (1/s). Raises ValueError if a number is missing or inadmissible.
-    """
-
-    kind: str
-    value: float
-    stderr: float | None = None
-    local: float | None = None  # Standard error, also of a parameter that is not determined
-    ci95: Pair | None = None
-    range: Pair | None = None
-    state: str | None = None
-    b: float = 0.0
-    b_stderr: float | None = None
-    b_ci95: Pair | None = None
-    scatter: float = 0.0
-    tests: tuple[float, ...] = ()
-    rates: tuple[float | None, ...] = ()
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for numbers that are not finite and for negative errors."""
-        numbers = {name: getattr(self, name) for name in ("value", "b", "scatter")}
-        errors = {name: getattr(self, name) or 0.0 for name in ("stderr", "local", "b_stderr")}
-        numbers |= {f"value of test {i + 1}": value for i, value in enumerate(self.tests)}
-        for name, value in (numbers | errors).items():
-            if not math.isfinite(value) or (name in errors and value < 0.0):
-                raise ValueError(f"{name} is {value}")
-        if self.kind not in (*KINDS, "fixed"):
-            raise ValueError(f"kind is {self.kind!r}")
-
-    @property
-    def error(self) -> float | None:
-        """Standard error; of the local covariance if the parameter is not determined."""
-        return self.stderr or self.local or None
-
-    @property
-    def span(self) -> Pair | None:
-        """Interval of a parameter without a standard error."""
-        return self.range or self.ci95
 
 
 class Miss(NamedTuple):
@@ -105,9 +53,10 @@ class Source:
     drive: str | None  # None if the tests of a joint fit have different drives
     interior_mass: bool
     status: str
-    rates: tuple[float, ...]  # Known rates of the fitted tests, 1/s
+    rate_of: dict[str, float | None]  # Of the fitted tests, 1/s; None if unknown
     rate0: float | None
-    parameters: dict[str, Identified]
+    parameters: dict[str, ParameterEstimate]  # Of the springs
+    errors: dict[str, float]  # Standard errors, also of parameters that are not determined
     # Names of uncertain parameters and slopes of rate laws ("s1_k0:b"), and their correlation.
     names: tuple[str, ...]
     correlation: Array
@@ -121,6 +70,11 @@ class Source:
     # For several cycles fitted as one history: the number of the last, and `Fit.growth`.
     last_cycle: float | None
     growth: float
+
+    @property
+    def rates(self) -> tuple[float, ...]:
+        """Known rates of the fitted tests, 1/s."""
+        return tuple(rate for rate in self.rate_of.values() if rate)
 
     def law_error(self, channel: str, noise: float) -> float:
         """Return half the 95 % band due to model error, relative to the measured range.
@@ -177,8 +131,10 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
         raise ValueError(f"drive is {drive!r}, not one of {', '.join(DRIVES)}")
     tests = content["tests"] if joint else {"": content}
     data, noise = content.get("data") or {}, content.get("noise") or {}
-    rates = {name: (test if joint else data).get("rate") for name, test in tests.items()}
-    parameters = dict(_parameters(content, model, joint, rates))
+    parameters = dict(_parameters(content["parameters"], model, joint))
+    local = content.get("correlation") or {}
+    errors = dict(zip(local.get("names") or (), local.get("stderr") or (), strict=False))
+    errors |= {name: one.stderr for name, one in parameters.items() if one.stderr}
     key = "covariance" if joint else "correlation"
     names, correlation = _correlation(content, key, "matrix", parameters)
     changing, together = _correlation(content, "specimens", "correlation", parameters)
@@ -190,9 +146,10 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
         drive=drive,
         interior_mass=bool(content.get("interior_mass", False)),
         status=str(content.get("status")),
-        rates=tuple(rate for rate in rates.values() if rate),
+        rate_of={name: (test if joint else data).get("rate") for name, test in tests.items()},
         rate0=content.get("rate0"),
         parameters=parameters,
+        errors={name: error for name, error in errors.items() if error},
         names=names,
         correlation=correlation,
         misses=_misses(list(tests.values())),
@@ -207,12 +164,10 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
 
 
 def _parameters(
-    content: Mapping[str, Any], model: Model, joint: bool, rates: Mapping[str, float | None]
-) -> Iterator[tuple[str, Identified]]:
+    content: Mapping[str, Any], model: Model, joint: bool
+) -> Iterator[tuple[str, ParameterEstimate]]:
     """Yield the parameters of the springs; nuisance parameters apply to one record only."""
-    local = content.get("correlation") or {}
-    errors = dict(zip(local.get("names") or (), local.get("stderr") or (), strict=False))
-    springs = {name: one for name, one in content["parameters"].items() if name not in NUISANCE}
+    springs = {name: one for name, one in content.items() if name not in NUISANCE}
     if unknown := springs.keys() - set(model.names):
         raise ValueError(f"{min(unknown)} is not a parameter of its model {model.name}")
     for name in model.names:
@@ -221,32 +176,36 @@ def _parameters(
         one = springs.get(name, {"value": 0.0, "kind": "fixed"})
         try:
             kind = one["kind"] if joint else "shared" if one.get("vary") else "fixed"
-            yield name, _identified(kind, {"local": errors.get(name)} | one, rates)
+            yield name, _parameter(kind, one)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueError(f"parameter {name}: {error}") from None
 
 
-def _identified(kind: str, one: Any, rates: Mapping[str, float | None]) -> Identified:
-    """Return one parameter of fit.json or joint.json; `rates` are the rates of the tests."""
-    tests = one["tests"] if kind in ("own", "scatter") else {}
+def _parameter(kind: str, given: Mapping[str, Any]) -> ParameterEstimate:
+    """Return one parameter of fit.json or joint.json; ValueError for an inadmissible number."""
+    if kind not in (*KINDS, "fixed"):
+        raise ValueError(f"kind is {kind!r}")
+    needed = {"b": kind in RATES, "scatter": kind == "scatter", "tests": kind in ("own", "scatter")}
+    for key in (key for key, is_needed in needed.items() if is_needed and given.get(key) is None):
+        raise ValueError(f"{key} is missing")
+    # null marks an open side
+    open_ends = {key: None for key in ("ci95", "range", "b_ci95") if None in (given.get(key) or ())}
+    one: ParameterEstimate = build(ParameterEstimate, {**given, **open_ends, "kind": kind}, {})
+    tests = one.tests if needed["tests"] and one.tests else {}
+    numbers = {"value": one.value, "b": one.b or 0.0, "scatter": one.scatter or 0.0}
+    numbers |= {f"value of {test}": at.value for test, at in tests.items()}
+    errors = {"stderr": one.stderr or 0.0, "b_stderr": one.b_stderr or 0.0}
+    for key, number in (numbers | errors).items():
+        if not math.isfinite(number) or (key in errors and number < 0.0):
+            raise ValueError(f"{key} is {number}")
     if kind == "scatter":  # the spread was found from the tests that determine the parameter
-        sure = {test: at for test, at in tests.items() if at.get("stderr") is not None}
+        sure = {test: at for test, at in tests.items() if at.stderr is not None}
         tests = sure if len(sure) > 1 else tests
-    # NaN is rejected: these kinds need these keys.
-    needed = {"b": math.nan if kind in RATES else 0.0}
-    needed |= {"scatter": math.nan if kind == "scatter" else 0.0}
-    content = needed | one | {"kind": kind, "rates": [rates.get(test) for test in tests]}
-    content["tests"] = [at["value"] for at in tests.values()]
-    for key in ("ci95", "range", "b_ci95"):  # null marks an open side
-        content[key] = None if None in (content.get(key) or ()) else content.get(key)
-    for key in ("stderr", "local", "b_stderr"):
-        content[key] = content.get(key) or None
-    identified: Identified = build(Identified, content, {})
-    return identified
+    return replace(one, tests=tests)
 
 
 def _correlation(
-    content: Mapping[str, Any], key: str, of: str, parameters: Mapping[str, Identified]
+    content: Mapping[str, Any], key: str, of: str, parameters: Mapping[str, ParameterEstimate]
 ) -> tuple[tuple[str, ...], Array]:
     """Return the names and the correlation in `content[key][of]`, which may be a covariance."""
     if content.get(key) is None:
@@ -279,289 +238,3 @@ def _misses(tests: list[Mapping[str, Any]]) -> dict[str, list[Miss]]:
             channel = "stress" if curve.startswith("stress") else curve.removesuffix("_time")
             found.setdefault(channel, []).append(Miss(misfit, share, most))
     return found
-
-
-# An own parameter has a trend with the rate if these conditions are met.
-EVIDENCE = 2.0  # least decrease of BIC
-FEWEST_OF_TREND = 5  # least number of tests
-SAME_RATE = 0.05  # least standard deviation of ln(rate)
-
-
-@dataclass(frozen=True, eq=False)
-class Population:
-    """The parameters that a result predicts for one test, in the order of the model, SI."""
-
-    source: Source
-    specimen: Specimen  # Of the test
-    rate: float | None  # Of the test, 1/s; None if unknown
-    # Limits of parameters in a fit of the test.
-    limits: Mapping[str, Pair] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        """Raise InputError if there is a rate law but no rate."""
-        laws = [name for name, one in self._parameters.items() if one.kind in RATES]
-        if laws and (self.rate is None or self.source.rate0 is None):
-            raise InputError(
-                f"{laws[0]} follows a rate law, but the rate "
-                f"{'of the test' if self.rate is None else 'rate0 of the result'} is not known; "
-                "give a time and a displacement column, or rate0 in joint.json"
-            )
-
-    @property
-    def _parameters(self) -> dict[str, Identified]:
-        return self.source.parameters
-
-    @cached_property
-    def _uncertain(self) -> list[str]:
-        """Names of free parameters with a common value."""
-        return [name for name, one in self._parameters.items() if one.kind not in ("own", "fixed")]
-
-    @cached_property
-    def held(self) -> tuple[str, ...]:
-        """Free parameters of unknown uncertainty, which are fixed at their values."""
-        pairs = ((name, self._parameters[name]) for name in self._uncertain)
-        return tuple(name for name, one in pairs if one.error is None and one.span is None)
-
-    @cached_property
-    def _open(self) -> tuple[tuple[str, ...], Array]:
-        """Names and covariance of free parameters and slopes, given `held` and the limits.
-
-        Limits are treated as independent measurements with the variance of a flat distribution.
-        """
-        free = [name for name in self._uncertain if name not in self.held]
-        free += [f"{name}:b" for name, one in self._parameters.items() if one.b_stderr]
-        at, places = _places(free, self.source.names)
-        held = _places(self.held, self.source.names)[1]
-        r, matrix = self.source.correlation, np.eye(len(free))
-        inner, across = r[np.ix_(places, places)], r[np.ix_(places, held)]
-        if held.size:
-            inverse = np.linalg.pinv(r[np.ix_(held, held)], hermitian=True)
-            inner = inner - across @ inverse @ across.T
-        matrix[np.ix_(at, at)] = inner
-        at, places = _places(free, self.scattering)  # their common values
-        matrix[np.ix_(at, at)] = self._correlation[np.ix_(places, places)]
-        errors = np.array([self._error(name) for name in free])
-        matrix = matrix * np.outer(errors, errors)
-        flat = [self._flat(n, self.limits[n]) if n in self.limits else math.inf for n in free]
-        bound = [i for i, sigma in enumerate(flat) if math.isfinite(sigma)]
-        prior, rows = [flat[i] ** 2 for i in bound], matrix[bound]
-        gain = np.linalg.lstsq(rows[:, bound] + np.diag(prior), rows, rcond=None)[0]
-        return tuple(free), matrix - rows.T @ gain
-
-    def _error(self, name: str) -> float:
-        """Return the standard error of a parameter or slope, SI; by its range if it has none."""
-        one = self._parameters[name.removesuffix(":b")]
-        slope = name.endswith(":b")
-        error, ends = (one.b_stderr, one.b_ci95) if slope else (one.error, one.ci95)
-        if error is None:
-            assert one.span is not None
-            return self._flat(name, one.span)
-        if ends is None or not self.source.joint:
-            return error
-        # With few tests, intervals are wider than the standard errors.
-        return max(error, 0.5 * (ends[1] - ends[0]) / NORMAL)
-
-    def _flat(self, name: str, span: Pair) -> float:
-        """Return the standard deviation of a flat distribution, or of a log-flat one, SI."""
-        (low, high), one = span, self._parameters[name]
-        if low > 0.0 and (is_logarithmic(split_name(name)[1]) or one.kind in ("scatter", *RATES)):
-            return abs(one.value) * math.log(high / low) / math.sqrt(12.0)
-        return (high - low) / math.sqrt(12.0)
-
-    @cached_property
-    def covariance(self) -> Array:
-        """Covariance (p, p) of the parameters due to the uncertainty of the result, linearised."""
-        free, matrix = self._open
-        slopes = np.zeros((len(self._parameters), len(free)))
-        for column, name in zip(slopes.T, free, strict=True):
-            one = self._parameters[name.removesuffix(":b")]
-            at, step = one.b if name.endswith(":b") else one.value, 1e-4 * self._error(name)
-            sides = [self._vector(self._means | {name: at + sign * step}) for sign in (-1.0, 1.0)]
-            column[:] = (sides[1] - sides[0]) / (2.0 * step)
-        return slopes @ matrix @ slopes.T
-
-    @cached_property
-    def quantile(self) -> float:
-        """Ratio of half a 95 % interval to the standard error: the median over the parameters.
-
-        Few degrees of freedom increase it. A limit or a curved valley changes single intervals and
-        hardly affects the median.
-        """
-        ratios = [
-            0.5 * (one.ci95[1] - one.ci95[0]) / one.stderr
-            for one in map(self._parameters.__getitem__, self._uncertain)
-            if one.ci95 is not None and one.stderr is not None and not self.source.joint
-        ]
-        return max(NORMAL, float(np.median(ratios))) if ratios else NORMAL
-
-    @cached_property
-    def scattering(self) -> tuple[str, ...]:
-        """Parameters that vary between specimens."""
-        return tuple(
-            name
-            for name, one in self._parameters.items()
-            if (one.kind == "scatter" and one.scatter > 0.0)
-            or (one.kind == "own" and np.ptp(one.tests) > 0.0)
-        )
-
-    @cached_property
-    def _correlation(self) -> Array:
-        """Correlation of the scattering parameters between specimens."""
-        names, own = self.scattering, self._own
-        out = np.eye(len(names))
-        at, places = _places(names, self.source.changing)
-        out[np.ix_(at, at)] = self.source.together[np.ix_(places, places)]
-        # For own parameters with a trend, or missing in the result, from their deviations.
-        if own.slopes.any() or not set(own.names) <= set(self.source.changing):
-            at, places = _places(names, own.names)
-            among_own = correlation(own.deviations, np.zeros((places.size, places.size)))
-            out[np.ix_(at, at)] = among_own[np.ix_(places, places)]
-        return out
-
-    @property
-    def fewest(self) -> int:
-        """Least number of tests that determine a scattering parameter; 0 if none scatters."""
-        return min((len(self._parameters[name].tests) for name in self.scattering), default=0)
-
-    @cached_property
-    def _own(self) -> _Own:
-        """Own parameters of the tests, as logarithms where `_in_logarithms` holds."""
-        names = tuple(name for name in self.scattering if self._parameters[name].kind == "own")
-        if not names:
-            return _Own((), np.empty(0), np.empty(0), np.empty((0, 0)), np.empty(0))
-        if len({len(self._parameters[name].tests) for name in names}) > 1:
-            raise InputError(
-                f"{self.source.where}: all own parameters must have values for the same tests"
-            )
-        values = np.array([self._parameters[name].tests for name in names]).T
-        logs = [self._in_logarithms(name) for name in names]
-        values[:, logs] = np.log(values[:, logs])
-        n, k = values.shape
-        mean, deviations = values.mean(axis=0), values - values.mean(axis=0)
-        slopes, leverage = np.zeros(k), np.full(k, 1.0 / n)
-        rates = [rate for rate in self._parameters[names[0]].rates if rate]
-        if self.rate is not None and len(rates) == n >= FEWEST_OF_TREND:
-            x = np.log(rates)
-            at, x = math.log(self.rate) - x.mean(), x - x.mean()
-            square = float(x @ x)
-            line = x @ deviations / max(square, 1e-300)
-            about = deviations - np.outer(x, line)
-            squares = np.maximum([np.sum(deviations**2, axis=0), np.sum(about**2, axis=0)], 1e-300)
-            gain = n * np.log(squares[0] / squares[1]) - math.log(n)
-            trend = (gain > EVIDENCE) & (square > n * SAME_RATE**2)
-            slopes = np.where(trend, line, 0.0)
-            mean, deviations = mean + slopes * at, np.where(trend, about, deviations)
-            leverage = leverage + np.where(trend, at**2 / max(square, 1e-300), 0.0)
-        freedom = max(n - 1 - bool(np.any(slopes)), 1)
-        spread = np.sqrt((1.0 + leverage) * np.sum(deviations**2, axis=0) / freedom)
-        return _Own(names, mean, slopes, deviations, spread)
-
-    @property
-    def trends(self) -> list[str]:
-        """Own parameters that have a trend with the rate."""
-        pairs = zip(self._own.names, self._own.slopes, strict=True)
-        return [name for name, slope in pairs if slope]
-
-    def _in_logarithms(self, name: str) -> bool:
-        return is_logarithmic(split_name(name)[1]) and min(self._parameters[name].tests) > 0.0
-
-    def _own_values(self, logarithms: Array) -> dict[str, float]:
-        """Return own parameters, SI, given their logarithms where `_in_logarithms` holds."""
-        pairs = zip(self._own.names, logarithms.tolist(), strict=True)
-        return {name: _exp(u) if self._in_logarithms(name) else u for name, u in pairs}
-
-    @property
-    def _means(self) -> dict[str, float]:
-        """Values at the rate of the test of own parameters with a trend."""
-        means = self._own_values(self._own.mean)
-        return {name: means[name] for name in self.trends}
-
-    @property
-    def point(self) -> Array:
-        """The common values, at the rate of the test."""
-        return self._vector(self._means)
-
-    def candidates(self) -> Iterator[Array]:
-        """Yield the common values, then those with the own values of each test, nearest first."""
-        yield self.point
-        own = self._own
-        scale = np.maximum(np.sqrt(np.sum(own.deviations**2, axis=0)), 1e-300)
-        for row in own.deviations[np.argsort(np.sum((own.deviations / scale) ** 2, axis=1))]:
-            yield self._vector(self._own_values(own.mean + row))
-
-    def draws(self, seed: int) -> Iterator[Array]:
-        """Draw parameters of specimens, from their scatter and the uncertainty of the result.
-
-        The scatter is correlated between parameters. Because its size is estimated from n tests, it
-        has Student's t distribution with n - 1 degrees of freedom.
-        """
-        rng, other = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
-        scatter, uncertain = _root(self._correlation), _root(self.covariance)
-        own, freedom = self._own, max(self.fewest - 1 - bool(self._own.slopes.any()), 1)
-        while True:
-            tail = math.sqrt(freedom / rng.chisquare(freedom))
-            drawn = tail * (scatter @ rng.standard_normal(len(self.scattering)))
-            deviates = dict(zip(self.scattering, drawn.tolist(), strict=True))
-            values = self._own_values(own.mean + own.spread * [deviates[n] for n in own.names])
-            for name in deviates.keys() - values.keys():
-                one = self._parameters[name]
-                values[name] = one.value * _exp(one.scatter * deviates[name])
-            yield self._vector(values) + uncertain @ other.standard_normal(len(self._parameters))
-
-    def _vector(self, changes: Mapping[str, float]) -> Array:
-        """Return all parameters at the rate and the height of the test.
-
-        `changes` replace common values and, with ":b", slopes of rate laws. The heights of a chain
-        are the specimen's, or else keep their shares of its height.
-        """
-        values = dict[str, float]()
-        for name, one in self._parameters.items():
-            value = changes.get(name, one.value)
-            if one.kind in RATES and self.rate is not None and self.source.rate0:
-                x = math.log(self.rate / self.source.rate0)
-                value *= factor(one.kind, changes.get(f"{name}:b", one.b), x)[0]
-            values[name] = value
-        heights = [name for name in self._parameters if name.endswith("_height")]
-        if heights and self.specimen.heights is not None:
-            values |= dict(zip(heights, self.specimen.heights, strict=True))
-        elif heights:
-            if self._parameters[heights[-1]].kind == "fixed":  # the rest of the height
-                total = sum(self._parameters[name].value for name in heights)
-                values[heights[-1]] = total - sum(values[name] for name in heights[:-1])
-            total = sum(values[name] for name in heights)
-            values |= {name: values[name] * self.specimen.height / total for name in heights}
-        return np.array(list(values.values()))
-
-
-class _Own(NamedTuple):
-    """k own parameters of n tests, as a sample of specimens.
-
-    If there is evidence for a trend with the rate, the mean of a parameter is a straight line over
-    the logarithm of the rate.
-    """
-
-    names: tuple[str, ...]
-    mean: Array  # (k,): at the rate of the test that is predicted
-    slopes: Array  # (k,): by the logarithm of the rate; 0 without evidence for a trend
-    deviations: Array  # (n, k): of the tests from the means
-    spread: Array  # (k,): standard deviation of a new specimen from the mean, as estimated
-
-
-def _places(
-    names: tuple[str, ...] | list[str], among: tuple[str, ...]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices of the names that occur in `among`, and their indices in `among`."""
-    pairs = [(i, among.index(name)) for i, name in enumerate(names) if name in among]
-    at, places = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
-    return at, places
-
-
-def _root(correlation: Array) -> Array:
-    """Return a matrix square root of a covariance; negative eigenvalues count as zero."""
-    power, axes = np.linalg.eigh(correlation)
-    return np.asarray(axes * np.sqrt(np.maximum(power, 0.0)))
-
-
-def _exp(value: float) -> float:
-    """Return the exponential, clipped to a finite value; no parameter may be that large."""
-    return math.exp(min(max(value, -700.0), 700.0))

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import lmfit
 import numpy as np
@@ -19,26 +19,20 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, naming
 from foamfit.fitting.curves import choose_drive
 from foamfit.fitting.links import KINDS, RATES, Links
-from foamfit.fitting.nuisance import Prior
+from foamfit.fitting.objective import Spent
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params
 from foamfit.fitting.search import Tracker, descend
 from foamfit.fitting.together import Together
 from foamfit.one_model import Options, Progress, identify
 from foamfit.report.folder import try_target
-from foamfit.settle import follow_samples, keep_to_record, sampled, weigh_motion
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
 from foamfit.study.joint_fit import Map, fit_jointly
-from foamfit.study.joint_result import (
-    FEW_FOLDERS,
-    JointResult,
-    common_covariance,
-    parameters_of,
-    with_words,
-)
+from foamfit.study.joint_result import FEW_FOLDERS, JointResult, result_of
 from foamfit.study.processes import begin, workers
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
+from foamfit.trust.settle import follow_samples, keep_to_record, weigh_motion
 
 # Number of tests fitted by a full search; the others start at the results of these.
 SEARCHED = 3
@@ -114,7 +108,7 @@ def joint(
     with workers(jobs, len(tests), FEW) as each:
         tests, alone = _own_fits(study, options, tests, refused, each, tell)
         links, starts = _links(study, tests), alone.starts(ONE_FOR_ALL)
-        names, rates = tuple(test.name for test in tests), tuple(test.rate for test in tests)
+        rates = [test.rate for test in tests]
         # The evidence is not computed for scatter, nor for rate laws if all rates are equal.
         kinds = [kind for kind in KINDS if kind not in ("scatter", *RATES)]
         kinds += RATES if None not in rates and _several(rates) else ()
@@ -127,22 +121,9 @@ def joint(
         every = (*fit.found.shared, *fit.found.own)
         compared = [name for name in every if links.kind(name) in RATES or name in auto]
         tried, slopes = joint_fit.evidence(fit.found, compared, alone.n_eff, kinds, [alone.values])
-        result = JointResult(
-            study=study,
-            tests=names,
-            files=tuple(test.file for test in tests),
-            rates=rates,
-            rate0=_median_rate(rates),
-            fit=fit,
-            parameters=parameters_of(fit, names),
-            covariance=common_covariance(fit),
-            evidence=tried,
-            open_slopes=slopes,
-            alone=alone,
-            refused=refused,
-            runtime_s=time.perf_counter() - began,
-        )
-        result = with_words(result)
+        files, rate0 = {test.name: test.file for test in tests}, _median_rate(rates)
+        about = {"evidence": tried, "refused": refused, "runtime_s": time.perf_counter() - began}
+        result = result_of(study, files, rates, rate0, fit, alone, slopes, **about)
     tell(1.0, "done")
     if out is not None:
         result.save(out, jobs=jobs, report=report)
@@ -288,41 +269,32 @@ def _own_fits(
     do([t for t in order if t not in first and t in found and found[t].cost > FAR * worst], (), 0.3)
     if len(found) < 2:
         _too_few(study, len(found), refused)
-    kept, vectors = list[_Test](), list[Array]()
+    kept = list[_Test]()
     for t, fitted in sorted(found.items()):
-        test, own = tests[t], fitted.values
-        problem = sampled(test.problem) if fitted.sampled else test.problem
-        test = replace(test, problem=problem.keeping(fitted.kept))
-        objective = test.problem.objective
-        if fitted.weighed_at is not None:
-            objective.weigh_motion(fitted.weighed_at)
-        if objective.drive == "impact" and test.rate is not None:
+        problem, test = fitted.problem, replace(tests[t], problem=fitted.problem)
+        if problem.objective.drive == "impact" and test.rate is not None:
             # The rate of the fitted motion: the fit's errors already include its error.
-            motion = objective.simulate(own, everything=True).curves["displacement_time"]
-            rate = loading_rate(test.problem.measurement, motion)
+            simulated = problem.objective.simulate(fitted.values, everything=True)
+            rate = loading_rate(problem.measurement, simulated.curves["displacement_time"])
             test = replace(test, rate=rate, rate_error=0.0)
         kept.append(test)
-        vectors.append(own)
+    vectors = [fitted.values for _, fitted in sorted(found.items())]
     return kept, Together.of_own_fits([test.problem for test in kept], vectors)
 
 
-@dataclass(frozen=True, eq=False)
-class _Own:
+class _Own(NamedTuple):
     """The fit of one test by itself."""
 
+    problem: Problem
     values: Array  # Parameters, SI
     cost: float  # χ² per sample
-    weighed_at: Array | None  # Point at which the uncertainty of the motion was weighed, if it was
-    kept: Mapping[str, Prior]  # Nuisance parameters held where the record shows them
-    sampled: bool  # Whether the samples of the motion drive, not its smooth curve
 
     @classmethod
     def of(cls, problem: Problem, tracker: Tracker, values: Array) -> _Own:
-        """Return the result of a search or a descent."""
-        objective, plain = problem.objective, tracker.plain
-        weighed_at = plain[0] if plain and objective.weighing is not None else None
-        cost, is_sampled = tracker.best_cost / objective.n_data, objective.followed == (None,)
-        return cls(values, cost, weighed_at, problem.kept, is_sampled)
+        """Return the result of a search or a descent; the joint fit counts its own evaluations."""
+        objective = replace(problem.objective, spent=Spent())
+        cost = tracker.best_cost / objective.n_data
+        return cls(replace(problem, objective=objective), values, cost)
 
 
 def _own_fit(

@@ -58,11 +58,7 @@ class JointFit:
 
 
 def fit_jointly(
-    problems: Sequence[Problem],
-    links: Links,
-    starts: Sequence[Vectors],
-    *,
-    each: Map = map,
+    problems: Sequence[Problem], links: Links, starts: Sequence[Vectors], *, each: Map = map
 ) -> JointFit:
     """Fit tests by `fitting.together.fit_linked` and find the uncertainty; `each` acts as `map`."""
     found = fit_linked(problems, links, starts)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from foamfit.api import FitResult
 from foamfit.arrays import Array
 from foamfit.data.calibration import contradictions
 from foamfit.fitting.links import RATES
@@ -22,8 +23,8 @@ from foamfit.fitting.together import Together
 from foamfit.report import render
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import check_target
-from foamfit.report.shown import Joint, JointViews
-from foamfit.report.studies.joint import JointParameter, TestValue, save_joint
+from foamfit.report.shown import JointViews
+from foamfit.report.studies.joint import save_joint
 from foamfit.results import SCHEMA, Fit, Loop, ParameterEstimate, loop_of, plain
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, unit_of
@@ -42,7 +43,9 @@ from foamfit.trust.covariance import Ends
 FEW_FOLDERS = 3
 # Items of the checklist that apply only to a search.
 _OF_A_SEARCH = ("ended", "agree")
+_BLANK = ParameterEstimate(math.nan, systematic=None)  # known for the fits of single tests only
 LARGEST = 300.0  # largest logarithm of a common value that the tests do not determine
+_NOT_IN_FILE = ("loops", "fits", "fit")  # fields that joint.json does not contain
 DOMINANT = 0.5  # a test with at least this share of χ² causes a warning
 
 
@@ -68,95 +71,67 @@ def fit_of_test(
     )
 
 
+@dataclass(frozen=True)
+class JointTest:
+    """One test of a joint fit, as in joint.json; older versions wrote fewer fields."""
+
+    __test__ = False  # for pytest: this is not a test class
+
+    file: str = ""
+    drive: str = ""
+    rate: float | None = None  #: Mean strain rate on loading, 1/s
+    misfit: dict[str, float | None] = field(default_factory=dict)
+    chi2_share: float = math.nan  #: Share in χ² of all tests
+    noise: dict[str, dict[str, Any]] = field(default_factory=dict)  #: Determines the weights
+    n_data: int = 0
+    data_sha256: str = ""
+    values: dict[str, float] = field(default_factory=dict)  #: Of the parameters, SI
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class JointResult(JointViews):
-    """The result of a joint fit; sequences are in the order of `tests`."""
+    """The result of a joint fit; the fields are those of joint.json, except the last ones.
 
-    study: Study
-    tests: tuple[str, ...]
-    files: tuple[Path, ...]
-    rates: tuple[float | None, ...]  # Mean strain rate on loading, 1/s
-    rate0: float | None  # Rate of the median test, 1/s
-    fit: JointFit
-    parameters: Mapping[str, JointParameter]
-    covariance: tuple[tuple[str, ...], Array]  # Names and matrix, SI; see `to_json_dict`
-    evidence: tuple[Alternative, ...]
-    alone: Together  # The separate fits of the tests
-    refused: Mapping[str, str]  # Files that were not used, with error messages
-    open_slopes: Mapping[str, float] = field(default_factory=dict)
+    "covariance" is that of shared values, common values of scattering parameters, and for rate laws
+    of the values at `rate0` and the slopes (":b"). "specimens" is the correlation of own and
+    scattering parameters between specimens.
+    """
+
+    name: str  #: Name of the study
+    model: str  #: See `Model.name`
+    tests: dict[str, JointTest]
+    parameters: dict[str, ParameterEstimate]
+    relaxation: int = 0
+    drive: str | None = None  #: None if the tests have different drives
+    seed: int = 0
+    rate0: float | None = None  #: Rate of the median test, 1/s
+    covariance: dict[str, Any] | None = None
+    specimens: dict[str, Any] | None = None
+    evidence: tuple[Alternative, ...] = ()
+    statistics: dict[str, float | int] = field(default_factory=dict)
+    refused: dict[str, str] = field(default_factory=dict)  #: Files, and why they were not used
     status: str = "ok"
     warnings: tuple[str, ...] = ()
     sentences: tuple[str, ...] = ()
-    runtime_s: float = 0.0
-
-    @property
-    def name(self) -> str:
-        """Name of the study."""
-        return self.study.name
-
-    @property
-    def model(self) -> str:
-        """The model as `--model` takes it."""
-        return self.study.model
+    runtime_s: float = math.nan
+    loops: tuple[Loop, ...] = ()  #: Measured and fitted loop of each test
+    #: Result of each test, or a function that makes it and can run in any process
+    fits: tuple[Fit | Callable[[], Fit], ...] = ()
+    fit: JointFit | None = None  #: The fit itself; None if the result was read from its folder
 
     @cached_property
-    def loops(self) -> tuple[Loop, ...]:
-        """Measured and fitted loop of each test."""
-        out = list[Loop]()
-        for name, best in zip(self.tests, self.fit.point.bests, strict=True):
-            curves, test = best.simulated.curves, best.problem.measurement
-            fitted = curves.get("stress_strain"), curves.get("stress_time")
-            if (loop := loop_of(test, *fitted)) is not None:
-                out.append(loop._replace(name=name))
-        return tuple(out)
+    def results(self) -> dict[str, FitResult]:
+        """Result of each test at the joint fit."""
+        made = (one if isinstance(one, Fit) else one() for one in self.fits)
+        return {name: FitResult(**vars(one)) for name, one in zip(self.tests, made, strict=True)}
 
     @property
-    def problems(self) -> tuple[Problem, ...]:
-        """The fitted problem of each test."""
-        return self.fit.found.problems
-
-    @property
-    def drive(self) -> str | None:
-        """The drive; None if the tests have different drives."""
-        drives = {problem.objective.drive for problem in self.problems}
-        return drives.pop() if len(drives) == 1 else None
-
-    @property
-    def bic(self) -> float:
-        """Bayesian information criterion, with the effective number of samples of `alone`."""
-        return self.fit.found.bic(self.alone.n_eff)
-
-    @property
-    def shares(self) -> tuple[float, ...]:
-        """Share of each test in χ²."""
-        costs = np.array(self.fit.found.costs)
-        total = float(costs.sum())
-        return tuple((costs / total if total else np.full(costs.size, 1.0 / costs.size)).tolist())
-
-    @cached_property
-    def noise(self) -> tuple[dict[str, dict[str, Any]], ...]:
-        """Noise of the fitted curves of each test, which determines the weights; see fit.json."""
-        return tuple(map(noise_of, self.fit.point.bests, self.fit.point.errors))
-
-    def estimates(self, test: int) -> dict[str, ParameterEstimate]:
-        """Return the parameters of one test, as in its fit.json."""
-        problem, values = self.problems[test], self.fit.found.values[test]
-        out = dict[str, ParameterEstimate]()
-        for name, value in zip(problem.names, (values + problem.origins).tolist(), strict=True):
-            if problem.is_exact(name):
-                continue
-            one, param = self.parameters[name], problem.params[name]
-            if param.vary:
-                at = one.estimate(self.tests[test])
-                method = at.ci95 and "local covariance"
-                out[name] = replace(at, value=value, ci95_method=method, range=None)
-            else:
-                why = "held fixed" if param.expr is None else f"tied by {param.expr}"
-                out[name] = ParameterEstimate(value, None, None, one.unit, False, "fixed", why)
-        return out
+    def rates(self) -> tuple[float | None, ...]:
+        """Mean strain rate on loading of each test, 1/s."""
+        return tuple(one.rate for one in self.tests.values())
 
     def save(
-        self: Joint,
+        self,
         folder: str | Path,
         *,
         jobs: int | None = None,
@@ -176,73 +151,116 @@ class JointResult(JointViews):
             return save_joint(self, folder, each, report=report, width=figure_width)
 
     def to_json_dict(self) -> dict[str, Any]:
-        """Return the content of joint.json: SI units, plain types, null for missing values.
-
-        "covariance" is that of shared values, common values of scattering parameters, and for rate
-        laws of the values at `rate0` and the slopes (":b"). "specimens" is the correlation of own
-        and scattering parameters between specimens.
-        """
-        found, model = self.fit.found, Model.parse(self.study.model)
-        content = {
-            "schema": SCHEMA,
-            "foamfit": version("foamfit"),
-            "name": self.study.name,
-            "model": model.words,
-            **model.options,
-            "relaxation": self.study.relaxation,
-            "drive": self.drive,
-            "seed": self.study.seed,
-            **{name: getattr(self, name) for name in ("status", "warnings", "sentences", "rate0")},
-            "tests": {
-                name: {
-                    "file": self.files[t],
-                    "drive": self.problems[t].objective.drive,
-                    "rate": self.rates[t],
-                    "misfit": found.misfits[t],
-                    "chi2_share": self.shares[t],
-                    "noise": self.noise[t],
-                    "n_data": self.problems[t].objective.n_data,
-                    "data_sha256": self.problems[t].measurement.data_sha256,
-                    "values": {name: one.value for name, one in self.estimates(t).items()},
-                }
-                for t, name in enumerate(self.tests)
-            },
-            "parameters": {name: one.to_json_dict() for name, one in self.parameters.items()},
-            "covariance": {"names": self.covariance[0], "matrix": self.covariance[1]},
-            "specimens": {"names": self.fit.correlation[0], "correlation": self.fit.correlation[1]},
-            **{n: getattr(self, n) for n in ("evidence", "statistics", "refused", "runtime_s")},
-        }
-        return dict(plain(content))
-
-    def test_fits(self) -> Iterator[Callable[[], Fit]]:
-        """Yield functions that make the result of each test and can run in any process."""
-        others = counted(len(self.tests) - 1, "other test")
-        note = f"Fitted together with {others} ({self.study.name}): intervals use all of them."
-        pairs = zip(self.problems, self.fit.found.values, strict=True)
-        for t, (problem, values) in enumerate(pairs):
-            yield partial(fit_of_test, problem, values, self.estimates(t), note, self.study.seed)
-
-    @property
-    def statistics(self) -> dict[str, float | int]:
-        """Statistics of the joint fit and of the separate fits."""
-        found = self.fit.found
-        return {
-            "n_tests": len(self.tests),
-            "n_data": found.n_data,
-            "n_vary": found.n_vary,
-            "chisqr": found.cost,
-            "redchi": found.cost / max(found.n_data - found.n_vary, 1),
-            "n_effective": self.fit.point.uncertainty.covariance.effective,
-            "n_eff": self.alone.n_eff,
-            "bic": self.bic,
-            "bic_alone": self.alone.bic(self.alone.n_eff),
-            "n_vary_alone": self.alone.n_vary,
-            "chisqr_alone": self.alone.cost,
-        }
+        """Return the content of joint.json: SI units, plain types, null for missing values."""
+        model, names = Model.parse(self.model), (one.name for one in fields(self))
+        content = {"schema": SCHEMA, "foamfit": version("foamfit")}
+        content |= {name: getattr(self, name) for name in names if name not in _NOT_IN_FILE}
+        shown: dict[str, Any] = plain(content | {"model": model.words, **model.options})
+        for one in shown["parameters"].values():
+            one["state"] = one["state"] or None  # of an own parameter
+        return shown
 
 
-def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
-    """Return the covariance of common values and slopes, SI; see `JointResult.to_json_dict`."""
+def result_of(
+    study: Study,
+    tests: Mapping[str, Path],
+    rates: Sequence[float | None],
+    rate0: float | None,
+    fit: JointFit,
+    alone: Together,
+    slopes: Mapping[str, float],
+    **about: Any,
+) -> JointResult:
+    """Return the result of a joint fit of `tests` (names and files) at these rates (1/s).
+
+    `alone` are the separate fits, and `slopes` those of `joint_fit.evidence`. `about` has further
+    fields of the result.
+    """
+    found, parameters = fit.found, parameters_of(fit, tuple(tests))
+    total = float(np.sum(found.costs))
+    shares = np.divide(found.costs, total) if total else np.full(len(tests), 1.0 / len(tests))
+    others = counted(len(tests) - 1, "other test")
+    note = f"Fitted together with {others} ({study.name}): intervals use all of them."
+    of_tests, fits, loops = dict[str, JointTest](), list[Callable[[], Fit]](), list[Loop]()
+    pairs = zip(tests.items(), rates, fit.point.bests, strict=True)
+    for t, ((name, file), rate, best) in enumerate(pairs):
+        problem, values, curves = best.problem, found.values[t], best.simulated.curves
+        measurement, objective = problem.measurement, problem.objective
+        estimates = _estimates(problem, values, name, parameters)
+        of_tests[name] = JointTest(
+            file=str(file),
+            drive=objective.drive,
+            rate=rate,
+            misfit=found.misfits[t],
+            chi2_share=float(shares[t]),
+            noise=noise_of(best, fit.point.errors[t]),
+            n_data=objective.n_data,
+            data_sha256=measurement.data_sha256,
+            values={one: estimate.value for one, estimate in estimates.items()},
+        )
+        fits.append(partial(fit_of_test, problem, values, estimates, note, study.seed))
+        loop = loop_of(measurement, curves.get("stress_strain"), curves.get("stress_time"))
+        loops += [] if loop is None else [loop._replace(name=name)]
+    drives = {one.drive for one in of_tests.values()}
+    result = JointResult(
+        name=study.name,
+        model=study.model,
+        relaxation=study.relaxation,
+        drive=drives.pop() if len(drives) == 1 else None,
+        seed=study.seed,
+        tests=of_tests,
+        rate0=rate0,
+        parameters=parameters,
+        covariance={"names": fit.point.names, "matrix": _common_covariance(fit)},
+        specimens={"names": fit.correlation[0], "correlation": fit.correlation[1]},
+        statistics=_statistics(fit, alone),
+        loops=tuple(loops),
+        fits=tuple(fits),
+        fit=fit,
+        **about,
+    )
+    return _with_words(result, fit, alone, slopes)
+
+
+def _estimates(
+    problem: Problem, values: Array, test: str, parameters: Mapping[str, ParameterEstimate]
+) -> dict[str, ParameterEstimate]:
+    """Return the parameters of one test, as in its fit.json."""
+    out = dict[str, ParameterEstimate]()
+    for name, value in zip(problem.names, (values + problem.origins).tolist(), strict=True):
+        if problem.is_exact(name):
+            continue
+        one, param = parameters[name], problem.params[name]
+        if param.vary:
+            at = one.in_test(test)
+            method = at.ci95 and "local covariance"
+            out[name] = replace(at, value=value, ci95_method=method, range=None)
+        else:
+            why = "held fixed" if param.expr is None else f"tied by {param.expr}"
+            out[name] = ParameterEstimate(value, None, None, one.unit, False, "fixed", why)
+    return out
+
+
+def _statistics(fit: JointFit, alone: Together) -> dict[str, float | int]:
+    """Return statistics of the joint fit and of the separate fits."""
+    found = fit.found
+    return {
+        "n_tests": len(found.problems),
+        "n_data": found.n_data,
+        "n_vary": found.n_vary,
+        "chisqr": found.cost,
+        "redchi": found.cost / max(found.n_data - found.n_vary, 1),
+        "n_effective": fit.point.uncertainty.covariance.effective,
+        "n_eff": alone.n_eff,
+        "bic": found.bic(alone.n_eff),
+        "bic_alone": alone.bic(alone.n_eff),
+        "n_vary_alone": alone.n_vary,
+        "chisqr_alone": alone.cost,
+    }
+
+
+def _common_covariance(fit: JointFit) -> Array:
+    """Return the covariance of common values and slopes, SI; see `JointResult`."""
     point, count = fit.point, len(fit.point.names)
     scales = np.ones(count)
     for i, name in enumerate(point.names):
@@ -251,10 +269,10 @@ def common_covariance(fit: JointFit) -> tuple[tuple[str, ...], Array]:
             scales[i] = math.exp(min(spread.mean, LARGEST)) if spread else fit.found.common[name][0]
             scales[i] *= spread.stderr / error if spread and error > 0.0 else 1.0
     matrix = point.uncertainty.covariance.matrix[:count, :count]
-    return point.names, matrix * np.outer(scales, scales)
+    return np.asarray(matrix * np.outer(scales, scales))
 
 
-def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, JointParameter]:
+def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, ParameterEstimate]:
     """Return all parameters of the joint fit, those of the springs first."""
     problems = fit.found.problems
     found = {
@@ -270,38 +288,38 @@ def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, JointParam
 
 
 def _contested(
-    one: JointParameter, test: str, judge: Callable[[Ends, tuple[str, str]], tuple[str, str]]
-) -> JointParameter:
+    one: ParameterEstimate, test: str, judge: Callable[[Ends, tuple[str, str]], tuple[str, str]]
+) -> ParameterEstimate:
     """Return a parameter with the states that contradictions in the record of a test leave it."""
-    if one.ci95 is not None and one.state is not None and one.why is not None:
+    if one.ci95 is not None and one.state:
         state, why = judge(one.ci95, (one.state, one.why))
         one = replace(one, state=state, why=why)
-    at = one.tests[test] if one.tests is not None else None
-    if at is None or at.ci95 is None:
+    if one.tests is None or test not in one.tests:
         return one
-    state, why = judge(at.ci95, (at.state, at.why))
-    return replace(one, tests={**(one.tests or {}), test: replace(at, state=state, why=why)})
+    own = _contested(one.tests[test], "", judge)
+    return replace(one, tests={**one.tests, test: own})
 
 
-def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParameter:
+def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> ParameterEstimate:
     """Return one parameter of the joint fit."""
-    found, unit, kind = fit.found, unit_of(name), fit.found.links.kind(name)
+    found, kind = fit.found, fit.found.links.kind(name)
     free = [t for t, problem in enumerate(found.problems) if name in problem.free()]
     each = _values(fit, tests, name)
     if not free:
+        fixed = next(iter(each.values()))
         value = float(np.median([one.value for one in each.values()]))
-        return JointParameter("fixed", value, unit, state="fixed", why="held fixed")
+        return replace(fixed, value=value, kind="fixed")
     if kind == "own":
         value = float(np.median([each[tests[t]].value for t in free]))
         why = "one value for each test; this is their median"
-        return JointParameter(kind, value, unit, why=why, tests=each)
+        return replace(_BLANK, value=value, unit=unit_of(name), why=why, kind=kind, tests=each)
     if kind == "scatter":
         return _scattering(fit, name, each)
     (value, *slope), span = found.common[name], fit.ranges.get(name)
     one = _judged(fit, free[0], name, value, fit.point.of_common(name), span)
     why = f"one value for {counted(len(free), 'test')}: {one.why}"
     why = f"at the rate of the median test; {why}" if slope else why
-    joint = JointParameter(kind, value, unit, one.stderr, one.ci95, one.state, why, range=span)
+    joint = replace(one, why=why, range=span, kind=kind)
     if not slope:
         return joint
     b, (error, freedom) = slope[0], fit.point.of_common(f"{name}:b")
@@ -317,29 +335,27 @@ def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> JointParam
     )
 
 
-def _scattering(fit: JointFit, name: str, tests: dict[str, TestValue]) -> JointParameter:
-    unit, spread, kind = unit_of(name), fit.spreads.get(name), "scatter"
+def _scattering(fit: JointFit, name: str, tests: dict[str, ParameterEstimate]) -> ParameterEstimate:
+    spread = fit.spreads.get(name)
+    one = replace(_BLANK, unit=unit_of(name), kind="scatter", tests=tests, state="not determined")
     if spread is None:
         why = "too few tests determine it to estimate its common value"
-        value = fit.found.common[name][0]
-        return JointParameter(kind, value, unit, state="not determined", why=why, tests=tests)
+        return replace(one, value=fit.found.common[name][0], why=why)
     sign = -1.0 if next(iter(tests.values())).value < 0.0 else 1.0
     value, *ends = (sign * np.exp(np.minimum([spread.mean, *spread.ci95], LARGEST))).tolist()
     ci95, limits = (min(ends), max(ends)), (-math.inf, math.inf)
     state, why = covariance.state(name, value, covariance.wider(ci95, None), abs(value), limits)
     determined = state != "not determined"
-    return JointParameter(
-        kind,
-        value,
-        unit,
-        abs(value) * spread.stderr if determined else None,
-        ci95 if determined else None,
-        state,
-        f"common value of {counted(spread.count, 'test')}: {why}",
-        tests,
-        spread.tau,
-        spread.tau_stderr,
-        spread.tau_ci95,
+    return replace(
+        one,
+        value=value,
+        stderr=abs(value) * spread.stderr if determined else None,
+        ci95=ci95 if determined else None,
+        state=state,
+        why=f"common value of {counted(spread.count, 'test')}: {why}",
+        scatter=spread.tau,
+        scatter_stderr=spread.tau_stderr,
+        scatter_ci95=spread.tau_ci95,
     )
 
 
@@ -349,68 +365,69 @@ def _judged(
     name: str,
     value: float,
     error: tuple[float, float],
-    span: tuple[float, float] | None = None,
-) -> TestValue:
+    span: Ends | None = None,
+) -> ParameterEstimate:
     """Judge a value by the wider of interval and range (`trust.covariance.RULE`).
 
     `error` contains standard error and degrees of freedom; limits and scale are those of `test`.
     """
     problem, (stderr, freedom) = fit.found.problems[test], error
-    limits = fit.point.bests[test].limits(name)
+    low, high = limits = fit.point.bests[test].limits(name)
     size = float(problem.sizes((name,), fit.found.values[test])[0])
     half = covariance.half_width(stderr, freedom)
     ends = (value - half, value + half)
-    judged = covariance.state(name, value, covariance.wider(ends, span), size, limits)
+    state, why = covariance.state(name, value, covariance.wider(ends, span), size, limits)
+    one = replace(_BLANK, value=value, unit=unit_of(name), state=state, why=why)
     if not half <= covariance.NOTHING * size:
-        return TestValue(value, None, None, *judged)
-    return TestValue(value, stderr, (max(ends[0], limits[0]), min(ends[1], limits[1])), *judged)
+        return one
+    return replace(one, stderr=stderr, ci95=(max(ends[0], low), min(ends[1], high)))
 
 
-def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, TestValue]:
+def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, ParameterEstimate]:
     """Return a parameter in each test that has it, with the zeros of the test's file."""
-    out, found = dict[str, TestValue](), fit.found
+    out, found = dict[str, ParameterEstimate](), fit.found
     for t, (test, problem) in enumerate(zip(tests, found.problems, strict=True)):
         if name not in problem.index or problem.is_exact(name):
             continue
-        value = float(found.values[t][problem.index[name]])
+        one = replace(_BLANK, value=float(found.values[t][problem.index[name]]), unit=unit_of(name))
         branch = fit.point.bests[t].unreached.get(name)
         if not problem.params[name].vary:
-            one = TestValue(value, None, None, "fixed", "held fixed")
+            one = replace(one, vary=False, state="fixed", why="held fixed")
         elif branch is not None and found.links.kind(name) == "own":
             why = f"branch {branch} was never reached"
-            one = TestValue(value, None, None, "not determined", why)
+            one = replace(one, state="not determined", why=why)
         else:
-            one = _judged(fit, t, name, value, fit.point.of_test(t, name))
-        zero = problem.measurement.origins.get(name, 0.0)
-        ends = one.ci95 and (one.ci95[0] + zero, one.ci95[1] + zero)
-        out[test] = replace(one, value=value + zero, ci95=ends)
+            one = _judged(fit, t, name, one.value, fit.point.of_test(t, name))
+        out[test] = one.counted_from(-problem.measurement.origins.get(name, 0.0))
     return out
 
 
-def with_words(result: JointResult) -> JointResult:
+def _with_words(
+    result: JointResult, fit: JointFit, alone: Together, open_slopes: Mapping[str, float]
+) -> JointResult:
     """Return a joint fit with its status, warnings and sentences."""
     lost, large = dict[str, None](), list[str]()
-    for t, (test, problem) in enumerate(zip(result.tests, result.problems, strict=True)):
-        for curve in problem.objective.counted:
-            misfit = result.fit.found.misfits[t][curve]
-            measured = problem.objective.measured[curve]
+    for (test, one), best in zip(result.tests.items(), fit.point.bests, strict=True):
+        objective = best.problem.objective
+        for curve in objective.counted:
+            misfit, measured = one.misfit[curve], objective.measured[curve]
             if misfit is None or not misfit <= UNACCEPTABLE * np.std(measured) / np.ptp(measured):
                 lost[test] = None
             elif misfit > POOR:
                 large.append(f"{test} ({curve} {percent(misfit)})")
-    share, top = max(zip(result.shares, result.tests, strict=True))
+    share, top = max((one.chi2_share, test) for test, one in result.tests.items())
     evidence = list[tuple[str, str, str, float]]()  # parameter, best kind, its kind, gain in BIC
     for chosen in (tried for tried in result.evidence if tried.chosen):
         others = (tried for tried in result.evidence if tried.parameter == chosen.parameter)
-        best = min(others, key=lambda tried: tried.bic)
-        evidence.append((chosen.parameter, best.kind, chosen.kind, chosen.bic - best.bic))
+        first = min(others, key=lambda tried: tried.bic)
+        evidence.append((chosen.parameter, first.kind, chosen.kind, chosen.bic - first.bic))
     rates = [rate for rate in result.rates if rate is not None]
     shown = {
         "parameters": list(result.parameters.items()),
         "laws": RATES,
         "rates": f"{min(rates):.3g} to {max(rates):.3g} 1/s" if rates else "",
         "slopes": [
-            (name, result.parameters[name].kind, half) for name, half in result.open_slopes.items()
+            (name, result.parameters[name].kind, half) for name, half in open_slopes.items()
         ],
     }
     warnings = render.sentences(
@@ -419,24 +436,24 @@ def with_words(result: JointResult) -> JointResult:
         lost=list(lost),
         wrong=[
             (test, one, best.problem.objective.drive)
-            for test, best in zip(result.tests, result.fit.point.bests, strict=True)
+            for test, best in zip(result.tests, fit.point.bests, strict=True)
             for one in unsettled(best, contradictions(best.problem.measurement))
         ],
         large=large,
         top=(top, share) if len(result.tests) > 3 and share > DOMINANT else None,
-        gap=result.bic - result.alone.bic(result.alone.n_eff),
-        together=span_of(result.fit.found.misfits),
-        alone=span_of(result.alone.misfits),
+        gap=result.statistics["bic"] - result.statistics["bic_alone"],
+        together=_span_of(fit.found.misfits),
+        alone=_span_of(alone.misfits),
         evidence=evidence,
         **shown,
     )
     kinds = dict[str, list[str]]()
-    for name, one in result.parameters.items():
-        kinds.setdefault(one.kind, []).append(name)
+    for name, parameter in result.parameters.items():
+        kinds.setdefault(str(parameter.kind), []).append(name)
     sentences = render.sentences(
         "joint_sentences",
         tests=len(result.tests),
-        n_vary=result.fit.found.n_vary,
+        n_vary=fit.found.n_vary,
         kinds=[f"{listed(names)} {kind}" for kind, names in kinds.items() if kind != "fixed"],
         scatter=[
             f"{name} {percent(one.scatter)} ({' to '.join(map(percent, one.scatter_ci95))})"
@@ -449,7 +466,7 @@ def with_words(result: JointResult) -> JointResult:
     return replace(result, status=status, warnings=warnings, sentences=sentences)
 
 
-def span_of(found: Sequence[dict[str, float | None]]) -> tuple[float, float] | None:
+def _span_of(found: Sequence[dict[str, float | None]]) -> Ends | None:
     """Return smallest and largest misfit of some fits, of the loop or else of a time curve."""
     names = ("stress_strain", "stress_time", "displacement_time")
     each = (next((fit[n] for n in names if fit.get(n) is not None), None) for fit in found)

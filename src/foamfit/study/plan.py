@@ -27,7 +27,6 @@ from foamfit.fitting.minimizer import problem_of
 from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.report.studies.plan import RISKY, Expected, Outcome, Plan
-from foamfit.saved import SavedJoint, load
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.parameters import NUISANCE
@@ -44,6 +43,7 @@ from foamfit.study.gain import (
     without_nuisance,
 )
 from foamfit.study.joint_result import JointResult
+from foamfit.study.saved import load
 from foamfit.text import counted
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
@@ -69,7 +69,7 @@ class Test:
 
 @single_threaded
 def plan(
-    *results: FitResult | JointResult | SavedJoint | str | Path,
+    *results: FitResult | JointResult | str | Path,
     rig: str | Path | None = None,
     quantity: str | None = None,
     seed: int = 0,
@@ -173,7 +173,7 @@ def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
             found.append(_published(one))
             continue
         read = load(one) if isinstance(one, str | Path) else one
-        fits = read.test_fits() if isinstance(read, SavedJoint | JointResult) else [read]
+        fits = read.results.values() if isinstance(read, JointResult) else [read]
         for fit in fits:
             if not isinstance(fit, FitResult):
                 raise InputError(f"{one} is not a fit or joint fit; name the folder of one")
@@ -382,11 +382,8 @@ def _thinned(seen: Seen) -> Seen:
 
 def _beyond(known: Known, left: Sequence[str], rig: Rig, *, impacts: bool) -> dict[str, str]:
     """Return, for parameters that no test of the rig determines, what other rig would."""
-    out, test, springs = (
-        dict.fromkeys(left, ""),
-        known.problem.measurement,
-        len(known.problem.model.kinds),
-    )
+    problem, out = known.problem, dict.fromkeys(left, "")
+    test, springs = problem.measurement, len(problem.model.kinds)
     few = replace(known, draws=known.draws[: DRAWS // 4])
     for what, other in beyond(rig, springs) if left else ():
         made = [one for one in candidates(other, test, springs) if not one.repeat]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from numbers import Integral
 from pathlib import Path
 
 import numpy as np
@@ -14,20 +13,17 @@ from foamfit.data.csv_file import read_test
 from foamfit.data.cycles import cycles_of, loading_rate
 from foamfit.data.measurement import Measurement
 from foamfit.data.noise import with_noise
-from foamfit.errors import InputError, SimulationError
+from foamfit.errors import InputError, SimulationError, check_whole
 from foamfit.fitting.curves import check_drive, check_time_shift, choose_drive, driving_motion
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.scenes import channel_of
 from foamfit.fitting.search import Tracker, descend
+from foamfit.parts import ParameterEstimate
 from foamfit.report import render
-from foamfit.report.studies.prediction import (
-    COLOURS,
-    PredictedCurve,
-    PredictedParameter,
-    Prediction,
-)
+from foamfit.report.studies.prediction import COLOURS, PredictedCurve, Prediction
 from foamfit.springs.parameters import unit_of
-from foamfit.study.identified import NORMAL, HasContent, Population, Source, read_source
+from foamfit.study.identified import NORMAL, HasContent, Source, read_source
+from foamfit.study.population import Population
 from foamfit.text import engineering
 
 DRAWS = 400  # default number of draws of specimens
@@ -83,9 +79,8 @@ def predict(
     SimulationError
         If the test cannot be simulated with the common values, or with too many of the draws.
     """
-    for name, value, least in (("draws", draws, FEWEST), ("seed", seed, 0)):
-        if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
-            raise InputError(f"{name} = {value!r} must be a whole number, at least {least}")
+    check_whole("draws", draws, FEWEST)
+    check_whole("seed", seed, 0)
     source = read_source(result)
     measurement = test if isinstance(test, Measurement) else read_test(test)
     rate = loading_rate(with_noise(measurement))
@@ -381,13 +376,19 @@ def _growth(measurement: Measurement, source: Source) -> Array:
 
 def _parameters(
     population: Population, point: Array, drawn: list[Array]
-) -> dict[str, PredictedParameter]:
+) -> dict[str, ParameterEstimate]:
     """Return each parameter at the test with its 95 % interval, within its limits."""
     half = population.quantile * np.sqrt(np.maximum(np.diag(population.covariance), 0.0))
     ends = np.quantile(drawn, BAND, axis=0) if drawn else np.array([point - half, point + half])
     ends = np.clip(ends, *_limits(population, point))
     rows = zip(population.source.parameters.items(), point.tolist(), *ends.tolist(), strict=True)
-    return {name: PredictedParameter(one.kind, *row) for (name, one), *row in rows}
+    out, blank = dict[str, ParameterEstimate](), ParameterEstimate(math.nan, systematic=None)
+    for (name, one), value, low, high in rows:
+        unit, vary = unit_of(name), one.kind != "fixed"
+        out[name] = replace(
+            blank, value=value, ci95=(low, high), unit=unit, vary=vary, kind=one.kind
+        )
+    return out
 
 
 def _limits(population: Population, point: Array) -> tuple[Array, Array]:

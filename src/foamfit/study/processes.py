@@ -21,11 +21,10 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from multiprocessing import connection
-from numbers import Integral
 from types import ModuleType
 from typing import Any
 
-from foamfit.errors import InputError
+from foamfit.errors import check_whole
 from foamfit.terminal import without_ctrl_c
 
 # Modules that are imported by fits, by their pages, by the drawing of figures and by joint fits.
@@ -50,12 +49,6 @@ def cores() -> int:
     """Return the number of cores that this process may use."""
     allowed = getattr(os, "sched_getaffinity", None)  # not on every system
     return len(allowed(0)) if allowed else os.cpu_count() or 1
-
-
-def check_jobs(jobs: int | None) -> None:
-    """Raise InputError for an invalid number of processes."""
-    if jobs is not None and (not isinstance(jobs, Integral) or jobs < 1):
-        raise InputError(f"jobs = {jobs!r} is not admissible; it must be a whole number from 1 up")
 
 
 def prepare(preload: Iterable[str]) -> None:
@@ -140,7 +133,8 @@ def begin(jobs: int | None, count: int, few: int) -> None:
 
 
 def _wanted(jobs: int | None, count: int, few: int) -> int:
-    check_jobs(jobs)
+    if jobs is not None:
+        check_whole("jobs", jobs, 1)
     return 1 if count <= few else min(cores() if jobs is None else jobs, count)
 
 

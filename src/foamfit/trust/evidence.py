@@ -24,7 +24,8 @@ from foamfit.fitting import levenberg
 from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import Tracker, squares
-from foamfit.results import Fit, rung_name
+from foamfit.parts import rung_name
+from foamfit.results import Fit
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
 from foamfit.trust.residuals.noise_process import autocorrelation_time

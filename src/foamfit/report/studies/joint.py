@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,67 +36,6 @@ LEAST_LOOP, LEAST_PANEL = 1.05, 1.55  # least widths, inches
 ROOMY = 2.1  # width of a panel with room for a title in one line, inches
 MOST_LOOPS = 48
 SEVERAL_RATES = 1.5  # ratio of rates; those of nominally equal tests differ by a few percent
-# Keys that only some kinds of parameters have.
-_OF_SCATTER = ("scatter", "scatter_stderr", "scatter_ci95")
-_OF_RATE = ("b", "b_stderr", "b_ci95", "b_range")
-
-
-@dataclass(frozen=True)
-class TestValue:
-    """A parameter in one test, in SI; None if the test does not determine it."""
-
-    __test__ = False  # for pytest: this is not a test class
-
-    value: float
-    stderr: float | None
-    ci95: tuple[float, float] | None
-    state: str
-    why: str
-
-
-@dataclass(frozen=True)
-class JointParameter:
-    """One parameter of a joint fit, in SI.
-
-    `kind` is one of `links.KINDS` or "fixed". `value` is the common value: for a scattering
-    parameter that of the median specimen, for a rate law that at the rate of the median test,
-    for an own parameter the median over the tests (which has no error). `scatter` is the standard
-    deviation of its logarithm between specimens, `b` the slope of the rate law. `tests` contains
-    the value in each test, unless it is the same in all.
-    """
-
-    kind: str
-    value: float
-    unit: str
-    stderr: float | None = None
-    ci95: tuple[float, float] | None = None
-    state: str | None = None
-    why: str | None = None
-    tests: Mapping[str, TestValue] | None = None
-    scatter: float | None = None
-    scatter_stderr: float | None = None
-    scatter_ci95: tuple[float, float] | None = None
-    b: float | None = None
-    b_stderr: float | None = None
-    b_ci95: tuple[float, float] | None = None
-    # Uncertainty with the error of the law (`joint_fit.ranges_of`); None without such an error.
-    range: tuple[float, float] | None = None
-    b_range: tuple[float, float] | None = None
-
-    def estimate(self, test: str | None = None) -> ParameterEstimate:
-        """Return the common value, or that of a test, as the parameter of a fit."""
-        if test is None or self.tests is None:
-            rest = (self.unit, True, self.state or "", self.why or "")
-            return ParameterEstimate(self.value, self.stderr, self.ci95, *rest, range=self.range)
-        at = self.tests[test]
-        return ParameterEstimate(at.value, at.stderr, at.ci95, self.unit, True, at.state, at.why)
-
-    def to_json_dict(self) -> dict[str, Any]:
-        """Return the entry of the parameter in joint.json."""
-        omitted = {"tests"} if self.tests is None else set[str]()
-        omitted.update(_OF_SCATTER if self.kind != "scatter" else ())
-        omitted.update(_OF_RATE if self.kind not in RATES else ())
-        return {key: value for key, value in asdict(self).items() if key not in omitted}
 
 
 def save_joint(
@@ -118,14 +56,14 @@ def save_joint(
         write_json(fresh / "joint.json", found.to_json_dict())
         shown = _of_springs(found)
         text = parameters_tex(
-            {name: one.estimate() for name, one in shown.items()},
+            shown,
             kinds={name: one.kind for name, one in shown.items()},
             between={name: between(one) for name, one in shown.items()},
         )
         write_text(fresh / "table.tex", text)
         folders, n = [fresh / name for name in found.tests], len(found.tests)
         # If other processes write these folders, the common figures are drawn at the same time.
-        written = each(_write_test, found.test_fits(), folders, [report] * n, [width] * n)
+        written = each(_write_test, found.fits, folders, [report] * n, [width] * n)
         pictures = list[bytes]()
         if report:
             for name, draw in (("joint", plot_joint), ("parameters", plot_compared)):
@@ -140,7 +78,7 @@ def save_joint(
     return save_whole(folder, write)
 
 
-def _of_springs(found: Joint) -> dict[str, JointParameter]:
+def _of_springs(found: Joint) -> dict[str, ParameterEstimate]:
     """Return the parameters of the springs except those fixed at zero."""
     every = found.parameters.items()
     return {n: p for n, p in every if n not in NUISANCE and (p.kind != "fixed" or p.value)}
@@ -190,7 +128,7 @@ def joint_page(found: Joint, folder: Path, loops: bytes, compared: bytes) -> str
             "",
             own["misfit"],
             parameters={
-                n: one.estimate(test) for n, one in shown.items() if one.tests and test in one.tests
+                n: one.in_test(test) for n, one in shown.items() if one.tests and test in one.tests
             },
             more=_more(own, levels),
         )
@@ -201,8 +139,7 @@ def joint_page(found: Joint, folder: Path, loops: bytes, compared: bytes) -> str
         loops=loops,
         compared=compared,
         parameters=[
-            (one, readable(name, one.estimate()), between(one))
-            for name, one in _of_springs(found).items()
+            (one, readable(name, one), between(one)) for name, one in _of_springs(found).items()
         ],
         rule=RULE,
         table=table_of(listed, folder, loops=False),
@@ -225,7 +162,7 @@ def _more(own: Mapping[str, Any], levels: Mapping[str, tuple[float, str]]) -> di
     return out
 
 
-def between(one: JointParameter) -> str:
+def between(one: ParameterEstimate) -> str:
     """Return a description of the variation of a parameter between the tests."""
     if one.kind == "scatter" and one.scatter is not None and one.scatter_ci95 is not None:
         low, high = one.scatter_ci95
@@ -279,9 +216,9 @@ def plot_compared(found: Joint, *, width: str = TWO) -> Figure:
         Panel(
             name,
             formula(own),
-            {names[t]: one.estimate(t) for t in names if one.tests and t in one.tests},
-            kind=one.kind,
-            common=one.estimate() if one.kind in ("shared", "scatter") else None,
+            {names[t]: one.in_test(t) for t in names if one.tests and t in one.tests},
+            kind=one.kind or "",
+            common=one if one.kind in ("shared", "scatter") else None,
             scatter=one.scatter,
         )
         for own, (name, one) in zip(symbols(shown), shown.items(), strict=True)
@@ -342,7 +279,7 @@ def _law_of_rate(ax: Axes, found: Joint, name: str, *, parted: bool) -> None:
         ax.minorticks_off()
     if one.b is not None and found.rate0 is not None:
         rates = np.geomspace(low, high, 50)
-        values = law_values(one.kind, one.value, one.b, np.log(rates / found.rate0))
+        values = law_values(str(one.kind), one.value, one.b, np.log(rates / found.rate0))
         ax.plot(rates, values / factor, label="rate law", color=VERMILION, linewidth=1.0)
         y, va = (0.05, "bottom") if one.b > 0.0 else (0.97, "top")
         slope = between(one).partition(" (")[0] if parted else between(one)

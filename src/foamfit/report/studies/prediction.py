@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
+from foamfit.parts import ParameterEstimate
 from foamfit.report import figures
 from foamfit.report import folder as results
 from foamfit.report.figures import BLUE, FITTED, INSIDE, SEEN, TWO, VERMILION
@@ -89,16 +90,6 @@ class PredictedCurve:
         return float(np.mean(self.parts[part][self.kept])) if part in self.parts else 0.0
 
 
-@dataclass(frozen=True)
-class PredictedParameter:
-    """A parameter as predicted for the test: its value and 95 % interval."""
-
-    kind: str  # As in joint.json; "shared" or "fixed" for the result of one test
-    value: float
-    lo: float
-    hi: float
-
-
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """Prediction, from a result, of a test that was not fitted; in SI."""
@@ -113,7 +104,7 @@ class Prediction:
     #: Curves that the drive does not prescribe, by their names in fit.json
     curves: dict[str, PredictedCurve]
     misfit: dict[str, float | None]  #: RMS of predicted minus measured over the measured range
-    parameters: dict[str, PredictedParameter]
+    parameters: dict[str, ParameterEstimate]  #: With `kind` as in joint.json
     rate: float | None  #: Mean strain rate of the test on loading, 1/s
     fitted_rates: tuple[float, ...]  #: Those of the fitted tests
     extrapolated: bool  #: Whether the rate lies outside the fitted ones

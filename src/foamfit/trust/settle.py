@@ -123,11 +123,6 @@ def _misfit(problem: Problem, values: Array) -> float:
     return max(value / float(np.ptp(objective.measured[name])) for name, value in rms.items())
 
 
-def sampled(problem: Problem) -> Problem:
-    """Return the problem with the samples of the driving motion, not its smooth curve."""
-    return replace(problem, objective=replace(problem.objective, followed=(None,)))
-
-
 def follow_samples(problem: Problem, tracker: Tracker) -> Problem:
     """Follow the samples of a driving motion, if its smooth curve is followed 5 % worse.
 
@@ -140,7 +135,7 @@ def follow_samples(problem: Problem, tracker: Tracker) -> Problem:
     values, cost = tracker.best_values, tracker.best_cost
     if not errs(BestPoint(problem, values)):
         return problem
-    rough = sampled(problem)
+    rough = replace(problem, objective=replace(smooth, followed=(None,)))
     trial = Tracker(rough.objective, tracker.deadline, ends=[values])
     descend_again(rough, trial)
     if trial.best_cost * WORSE**2 < cost:

@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import lmfit
 import numpy as np
 
 from foamfit.api import FitResult
 from foamfit.arrays import Array
-from foamfit.codec import build, decode, reading
+from foamfit.codec import build, reading
 from foamfit.errors import InputError
 from foamfit.files import read_whole, reason
 from foamfit.report.folder import load_result
 from foamfit.report.samples import FILE as SAMPLES
 from foamfit.report.samples import read_samples
-from foamfit.report.shown import JointViews
 from foamfit.report.studies.batch import read_table
 from foamfit.report.studies.cycles import CycleFits
-from foamfit.report.studies.joint import JointParameter
-from foamfit.results import KEPT, Loop
+from foamfit.results import KEPT
+from foamfit.springs.model import Model
 from foamfit.study.joint_result import JointResult
 from foamfit.trust.identifiability import Insight
 
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def load(folder: str | Path) -> FitResult | SavedJoint | CycleFits | pd.DataFrame:
+def load(folder: str | Path) -> FitResult | JointResult | CycleFits | pd.DataFrame:
     """Return the result in the folder of a fit, a joint fit, several cycles or a batch.
 
     It equals the result that was saved, and saving it again writes the same files. For a batch it
@@ -88,57 +87,22 @@ def _columns(path: Path, samples: object) -> dict[str, Array]:
         raise InputError(f"{path} is damaged: {str(error).partition(';')[0]}") from None
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class SavedJoint(JointViews):
-    """A joint fit read from its folder; the fields are those of joint.json."""
-
-    name: str
-    model: str
-    status: str
-    warnings: tuple[str, ...]
-    sentences: tuple[str, ...]
-    tests: tuple[str, ...]
-    rates: tuple[float | None, ...]  #: Mean strain rate on loading of each test, 1/s
-    rate0: float | None  #: Rate of the median test, 1/s
-    parameters: dict[str, JointParameter]  #: SI; `tests` of each has its values by test
-    results: dict[str, FitResult]  #: Result of each test at the joint fit
-    content: dict[str, Any]  #: All of joint.json
-
-    @property
-    def loops(self) -> tuple[Loop, ...]:
-        """The measured and fitted loop of each test."""
-        found = ((name, one.loop) for name, one in self.results.items())
-        return tuple(loop._replace(name=name) for name, loop in found if loop is not None)
-
-    save = JointResult.save
-
-    def to_json_dict(self) -> dict[str, Any]:
-        """Return the content of joint.json."""
-        return self.content
-
-    def test_fits(self) -> Iterator[FitResult]:
-        """Iterate over the results of the tests, in the order of `tests`."""
-        return map(self.results.__getitem__, self.tests)
-
-
-def _joint(folder: Path) -> SavedJoint:
+def _joint(folder: Path) -> JointResult:
     """Read joint.json and the folders of its tests."""
     content = load_result(folder / "joint.json")
     with reading(f"{folder / 'joint.json'}"):
-        tests = content["tests"]
-        given = content | {"content": content, "results": {}, "tests": list(tests)}
-        given["rates"] = [one["rate"] for one in tests.values()]
-        made: SavedJoint = build(SavedJoint, given, {})
-    made.results.update({name: _fit(folder / name) for name in made.tests})
-    return made
+        given = content | {"model": Model.of_result(content).name}
+        made: JointResult = build(JointResult, given, {})
+    fits = {name: _fit(folder / name) for name in made.tests}
+    loops = ((name, one.loop) for name, one in fits.items())
+    found = tuple(loop._replace(name=name) for name, loop in loops if loop is not None)
+    return replace(made, loops=found, fits=tuple(fits.values()))
 
 
 def _cycles(folder: Path) -> CycleFits:
     """Read cycles.json and the folders of its cycles."""
     content = load_result(folder / "cycles.json")
     with reading(f"{folder / 'cycles.json'}"):
+        made: CycleFits = build(CycleFits, content | {"results": {}}, {})
         names = content["fitted"]
-        refused = decode(dict[int, str], content["refused"], {})
-        given = content["test"], content["model"], tuple(content["recorded"])
-        made = content.get("data_sha256", ""), content.get("options")
-    return CycleFits(*given, {n: _fit(folder / f"cycle-{n}") for n in names}, refused, *made)
+    return replace(made, results={n: _fit(folder / f"cycle-{n}") for n in names})
