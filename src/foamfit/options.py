@@ -14,16 +14,12 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, Any, Self, TypedDict, TypeVar
+from typing import Any, Self, TypedDict, TypeVar
 
 from foamfit.errors import InputError
 
-if TYPE_CHECKING:
-    from foamfit.arrays import Array
-    from foamfit.fitting.problem import Problem
-
-# Called with the problem and the best point, many times a second, so it must be quick.
-Watch = Callable[["Problem", "Array"], None]
+# Called with the `Problem` and the best point, an array, many times a second, so it must be quick.
+Watch = Callable[[Any, Any], None]
 F = TypeVar("F", bound=Callable[..., Any])
 
 DRIVES = ("impact", "stress", "displacement")
