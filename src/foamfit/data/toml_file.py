@@ -56,25 +56,6 @@ class Rule:
         return value
 
 
-@dataclass(frozen=True)
-class Quantity:
-    """Check of a quantity: its SI unit, and an example."""
-
-    si: str
-    example: str
-    positive: bool = True
-
-    def __call__(self, value: Any, where: str) -> Any:
-        """Return the quantity in SI."""
-        return self._within(value, where, parse_quantity(value, self.si, where, self.example))
-
-    def _within(self, value: Any, where: str, *numbers: float) -> float:
-        """Return the first number; InputError if the numbers must be positive and are not."""
-        if self.positive and min(numbers) <= 0.0:
-            raise InputError(f'{where} = "{value}" must be positive, like "{self.example}".')
-        return numbers[0]
-
-
 class Stated(NamedTuple):
     """A quantity in SI and its standard deviation, None if the file does not state it."""
 
@@ -82,15 +63,25 @@ class Stated(NamedTuple):
     sigma: float | None
 
 
-class Uncertain(Quantity):
-    """Check of a quantity that may have a standard deviation; its SI unit, and an example."""
+@dataclass(frozen=True)
+class Quantity:
+    """Check of a quantity: its SI unit, an example, and whether it may have a ± (`Stated`)."""
 
-    def __call__(self, value: Any, where: str) -> Stated:
-        """Return quantity and standard deviation in SI."""
-        zero = not self.positive
-        stated = Stated(*parse_uncertain(value, self.si, where, self.example, zero=zero))
-        self._within(value, where, stated.value)
-        return stated
+    si: str
+    example: str
+    positive: bool = True
+    uncertain: bool = False
+
+    def __call__(self, value: Any, where: str) -> Any:
+        """Return the quantity in SI."""
+        given, sigma = (value, self.si, where, self.example), None
+        if self.uncertain:
+            number, sigma = parse_uncertain(*given, zero=not self.positive)
+        else:
+            number = parse_quantity(*given)
+        if self.positive and number <= 0.0:
+            raise InputError(f'{where} = "{value}" must be positive, like "{self.example}".')
+        return Stated(number, sigma) if self.uncertain else number
 
 
 class Span(Quantity):
@@ -121,10 +112,8 @@ class Several:
         """Return the checked values."""
         if not isinstance(value, list) or not value:
             raise InputError(f"{where} must be a list {self.right}.")
-        places = (
-            f"{where} {self.item} {i}" if self.item else where for i in range(1, 1 + len(value))
-        )
-        return tuple(map(self.each, value, places))
+        at = [f"{where} {self.item} {i}" if self.item else where for i, _ in enumerate(value, 1)]
+        return tuple(map(self.each, value, at))
 
 
 @dataclass(frozen=True)
@@ -226,15 +215,17 @@ def checked(
 
 _SECTIONS: dict[str, dict[str, Check]] = {
     "specimen": {
-        "height": Uncertain("m", "1.19 mm"),
-        "diameter": Uncertain("m", "5 mm"),
-        "area": Uncertain("m**2", "19.6 mm^2"),
-        "mass": Uncertain("kg", "5.56 mg"),
-        "heights": Several(Uncertain("m", "0.7 mm"), 'like ["0.700 mm", "0.490 mm"], base first'),
+        "height": Quantity("m", "1.19 mm", uncertain=True),
+        "diameter": Quantity("m", "5 mm", uncertain=True),
+        "area": Quantity("m**2", "19.6 mm^2", uncertain=True),
+        "mass": Quantity("kg", "5.56 mg", uncertain=True),
+        "heights": Several(
+            Quantity("m", "0.7 mm", uncertain=True), 'like ["0.700 mm", "0.490 mm"], base first'
+        ),
     },
     "striker": {
-        "mass": Uncertain("kg", "7 g"),
-        "velocity": Uncertain("m/s", "1.75 m/s"),
+        "mass": Quantity("kg", "7 g", uncertain=True),
+        "velocity": Quantity("m/s", "1.75 m/s", uncertain=True),
         "gravity": FLAG,
     },
     "noise": {"stress": Quantity("Pa", "20 kPa"), "displacement": Quantity("m", "2 um")},
@@ -257,7 +248,7 @@ _PRIOR = Rule(lambda v: isinstance(v, str), 'like "5.5 ± 0.1 MPa"')
 _FILE = Rule(
     lambda v: isinstance(v, str) and v.strip() != "" and "\0" not in v, 'a file, like "camera.csv"'
 )
-_DELAY = Uncertain("s", "0 ± 50 us", positive=False)
+_DELAY = Quantity("s", "0 ± 50 us", positive=False, uncertain=True)
 # Names in `Settings.uncertainties` that differ from the key.
 _SPREADS = {"specimen mass": "specimen_mass", "striker mass": "striker_mass"}
 _SCALE = "4444.4 N/V"
