@@ -121,7 +121,7 @@ class Plan(NamedTuple):
         drag = self.drag if drag is None else drag
         given = rows, heights, rtol, drag, directions, everything
         motion = self._integrated(*given, LOGGED if everything else 0)
-        if everything and len(motion.switches) > LOGGED:
+        if everything and len(motion.switches) > LOGGED and motion.method != AGGREGATE:
             motion = self._integrated(*given, len(motion.switches))
         return motion
 
