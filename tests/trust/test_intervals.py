@@ -26,7 +26,7 @@ from foamfit.data.measurement import Specimen, Striker
 from foamfit.errors import InputError
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord, Tracker
-from foamfit.one_model import Found, judge
+from foamfit.one_model import Found, Options, judge
 from foamfit.report import result_figures
 from foamfit.report.result_figures import plot_profiles
 from foamfit.results import Profile
@@ -438,14 +438,13 @@ def test_ctrl_c_keeps_what_was_drawn(after, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("method", "draws", "word"),
     [
-        ("guess", 0, "unknown"),
-        ("bootstrap", 500, "must be one of auto, local, profile, mcmc"),
-        ("mcmc", 5, "too few"),
+        ("guess", None, "'guess' .* must be one of auto, local, profile, mcmc"),
+        ("mcmc", 5, "draws = 5 .* from 100"),
     ],
 )
 def test_refuses_what_cannot_be_done(method, draws, word):
     with pytest.raises(InputError, match=word):
-        Choice(method, draws)
+        Options(intervals=method, draws=draws)
 
 
 def test_says_in_one_sentence_that_emcee_is_missing(monkeypatch):
