@@ -24,8 +24,8 @@ from foamfit.data.noise import noise_level
 from foamfit.results import Fit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-import real_foams
 import studies
+from real_foams import SHOE_FOAM, SOURCE, first_cycles, varied
 
 HERE = Path(__file__).parent
 TABLE, PARAMETERS, BACK = (HERE / f"{name}.csv" for name in ("memory", "parameters", "ways_back"))
@@ -46,7 +46,7 @@ MEMORY: dict[str, Any] = {"model": "microscale", "stiffening": True, "mullins": 
 
 def histories(data: Path, folder: Path) -> Iterator[tuple[str, Path, Path]]:
     """Yield name, file and TOML of each specimen with several cycles in a file."""
-    own = [("turbo-comp-1", *real_foams.SHOE_FOAM["turbo-comp-1"], data / "shoe-foam")]
+    own = [("turbo-comp-1", *SHOE_FOAM["turbo-comp-1"], data / "shoe-foam")]
     twins = [(*one, data / "shoe-foam-twins") for one in studies.twins(data / "shoe-foam-twins")]
     for name, height, diameter, place in (*own, *twins):
         toml = studies.write_specimen(folder / f"{name}-cycles.toml", height, diameter)
@@ -110,7 +110,7 @@ def study(data: Path) -> None:
                 "test": test, "what": what, "parameter": name, "value": p.value,
                 "stderr": p.stderr, "unit": p.unit, "state": p.state,
             }
-            for name, p in (real_foams.varied(result) if what != PREDICTED else {}).items()
+            for name, p in (varied(result) if what != PREDICTED else {}).items()
         )  # fmt: skip
         studies.write_csv(rows, TABLE)
         studies.write_csv(values, PARAMETERS)
@@ -118,7 +118,7 @@ def study(data: Path) -> None:
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for test in real_foams.first_cycles(data, folder):
+        for test in first_cycles(data, folder):
             result, seconds = fitted(test, relaxation=1)
             miss = misfits(test, result)[test.cycle]
             row = {"cycle": 1, "misfit": miss, "inside": np.nan, "seconds": seconds}
@@ -159,7 +159,7 @@ def draw(later: ff.Prediction, path: Path) -> None:
             ax.legend(loc="upper left")
         axes[0].set_ylabel("stress (kPa)")
         figure.suptitle(
-            f"{SHOWN}, one set of parameters; measured: {real_foams.SOURCE}",
+            f"{SHOWN}, one set of parameters; measured: {SOURCE}",
             x=0.012, ha="left", fontsize=8.0,
         )  # fmt: skip
 
@@ -237,7 +237,7 @@ def main() -> None:
         study(data)
     table, values = pd.read_csv(TABLE), pd.read_csv(PARAMETERS)
     studies.write_page(
-        HERE, source=real_foams.SOURCE, summary=summary(table), specimens=per_specimen(table),
+        HERE, source=SOURCE, summary=summary(table), specimens=per_specimen(table),
         values=values_table(values), inside=coverage(table), seconds=seconds(table),
         verified=coverage(table, chosen=False), back=turned_back_table(pd.read_csv(BACK)),
     )  # fmt: skip

@@ -182,12 +182,12 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterato
     )
     row = {"class": name, "rows": rows, "noise": noise, "ms": 1e3 * seconds}
     yield row | {
-        "what": "motion", "rms": off / noise @ off / noise / rows, "dof": found.dof,
+        "what": "motion", "rms": off / noise @ off / noise / rows,
         "near": float(np.mean((off[near] / noise) ** 2)) if near.any() else np.nan,
         "held": held.mean(), "held_near": held[near].mean() if near.any() else np.nan,
         "worst": np.abs(off).max() / noise, "sigma": found.sigma / noise,
-        "turns": len(motion.turns), "invented": len(found.turns) - len(pairs), "back": back,
-        "kinks": found._modes.kinks.shape[1], "modes": found.modes(t[:1]).shape[1],
+        "invented": len(found.turns) - len(pairs), "back": back,
+        "modes": found.modes(t[:1]).shape[1],
     }  # fmt: skip
     sizes = np.abs(np.diff(motion.at(np.concatenate([[0.0], motion.turns, [1.0]]))))
     for i, at in enumerate(motion.turns):
