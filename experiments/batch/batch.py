@@ -190,7 +190,7 @@ def measure_parts(place: Path) -> dict[str, Any]:
         written = time.process_time()
         for path in paths:
             fingerprint(recipe.key, path.read_bytes(), toml.read_bytes(), None)
-            stored(out / path.stem, first.mark, recipe)
+            stored(out / path.stem, first.fingerprint, recipe)
         again = time.process_time()
         found[name] = {
             "files": len(files),
