@@ -28,8 +28,8 @@ import numpy as np
 import pandas as pd
 
 import foamfit as ff
-import scenes as kinds
-from scenes import KERNEL, PUBLIC, Competitor, Scene
+import rivals as kinds
+from rivals import KERNEL, PUBLIC, Competitor, Scene
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies

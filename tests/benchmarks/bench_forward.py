@@ -21,7 +21,7 @@ import foamfit as ff
 from foamfit.solve.plan import plan
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments" / "error_vs_runtime"))
-import scenes as kinds
+import rivals as kinds
 
 SIZES = (1, 10, 100, 1000)
 SAMPLES = (100, 1000, 10_000, 100_000)
