@@ -206,9 +206,7 @@ def fit(
         compile_rest()
         if not output.no_report:
             drawers.begin()
-        # Of several cycles, each has the time limit for itself.
-        limit = ready.search["max_time"] if ready.several is None else None
-        with progress_line(output.silent, "fit", limit, says=not output.quiet) as news:
+        with progress_line(output.silent, "fit", says=not output.quiet) as news:
             found = replace(ready.fit(news), options=made)
 
         def save(place: Path, **how: Any) -> None:
