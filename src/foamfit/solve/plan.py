@@ -436,6 +436,8 @@ def plan(
     most = MOST_WORK // count + 2 * time.size + 8 * count
     most = max(1, min(max_steps, most, MOST_SAMPLED // count))
     explicit = min(most, 20 * time.size + max(1000, MOST_EXPLICIT_WORK // count))
+    if internal:  # whose own rates no estimate knows; implicit steps are tried after a few
+        explicit = min(explicit, most // 4)
     drag, terms = chain.site_damping / chain.height, max(chain.relaxation)
     return Plan(
         solver, laws, terms, chain.height, ends, masses, drag, top, values, time, speed, margin,
