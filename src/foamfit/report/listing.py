@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -110,7 +111,9 @@ def _listed(path: Path) -> Listed:
         }
         every = {name: one for name, one in content["parameters"].items() if name not in NUISANCE}
         known = [p for p in every.values() if p.get("vary", p.get("kind") != "fixed")]
-        alone = path.name == "fit.json"
+        estimates = dict[str, ParameterEstimate]()
+        with suppress(KeyError, TypeError, ValueError):  # of a joint fit, or of an older version
+            estimates = {name: build(ParameterEstimate, p, {}) for name, p in every.items()}
         return Listed(
             place,
             str(content.get("test") or content.get("name")),
@@ -121,7 +124,7 @@ def _listed(path: Path) -> Listed:
             determined=sum(one.get("state") == "determined" for one in known),
             varied=len(known),
             when=when,
-            parameters={n: build(ParameterEstimate, p, {}) for n, p in every.items() if alone},
+            parameters=estimates,
             curves=small_loop(place / "curves.csv"),
         )
     except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
