@@ -45,8 +45,8 @@ def photograph_page() -> None:
             window = browser.new_page(viewport=WINDOW)
             assert served.stdout is not None
             window.goto(served.stdout.readline().strip())
-            test = "foam-1: model-2-2.0mps-reconstruction"
-            window.get_by_label("reconstruction").select_option(test)
+            window.get_by_role("button", name="Try an example").click(timeout=60_000)
+            window.get_by_label("s1_k0", exact=True).wait_for(timeout=60_000)
             window.get_by_role("button", name="Fit", exact=True).click(timeout=60_000)
             window.get_by_role("button", name="Back to the fit").wait_for(timeout=120_000)
             window.evaluate("scrollTo(0, 0)")
