@@ -337,13 +337,12 @@ def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
 def _advised(outcomes: Sequence[Outcome], safe: Sequence[int], now: float) -> int:
     """Return the place of the advised test among those that are `safe`.
 
-    A rig that breaks costs as much as all parameters. Of the tests that determine most parameters
-    it is the one with the least error of the quantity asked for, or else the softest, or if none
-    determines more than `now` the one with the narrowest intervals; of tests with rivals one that
-    tells them apart.
+    Of the tests that determine most parameters it is the one with the least error of the quantity
+    asked for, or else the softest, or if none determines more than `now` the one with the narrowest
+    intervals; of tests with rivals one that tells them apart.
     """
-    worth = {i: outcomes[i].number - outcomes[i].breaks * len(outcomes[i].expected) for i in safe}
-    good = [i for i in safe if worth[i] >= max(worth.values()) - NEARLY]
+    most = max(outcomes[i].number for i in safe)
+    good = [i for i in safe if outcomes[i].number >= most - NEARLY]
     told = [i for i in good if all(x >= TOLD_APART for x in outcomes[i].apart.values())]
     if not told:
         return max(good, key=lambda i: min(outcomes[i].apart.values()))
@@ -354,7 +353,7 @@ def _advised(outcomes: Sequence[Outcome], safe: Sequence[int], now: float) -> in
         asked = outcomes[i].candidate
         return asked.interior is not None, asked.hold, asked.cycles, outcomes[i].force
 
-    if max(outcomes[i].number for i in good) <= now + NEARLY:
+    if most <= now + NEARLY:
         return min(told, key=lambda i: outcomes[i].narrowness)
     return min(told, key=effort)
 
