@@ -23,8 +23,8 @@ def outputs_of(notebook):
 
 
 def text_of(notebook):
-    """Return all printed text of a notebook."""
-    each = outputs_of(notebook)
+    """Return all printed text of a notebook, without warnings."""
+    each = [one for one in outputs_of(notebook) if one.get("name") != "stderr"]
     return "\n".join(o.get("text", "") + o.get("data", {}).get("text/plain", "") for o in each)
 
 

@@ -48,7 +48,8 @@ class Iterate:
     @cached_property
     def normal(self) -> Array:
         """Normal matrix JᵀJ."""
-        normal = self.jacobian.T @ self.jacobian
+        with np.errstate(over="ignore", invalid="ignore"):  # derivatives of a hopeless trial
+            normal = self.jacobian.T @ self.jacobian
         return np.asarray(normal if isinstance(normal, np.ndarray) else normal.toarray())
 
     def expected(self, step: Array) -> float:
