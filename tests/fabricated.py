@@ -10,8 +10,9 @@ import numpy as np
 
 from foamfit.api import FitResult
 from foamfit.data.measurement import ASKED, Measurement, Specimen, Striker
+from foamfit.parts import ParameterEstimate
 from foamfit.report.result_figures import Images
-from foamfit.results import SOURCES, Budget, Curves, ParameterEstimate, Switch
+from foamfit.results import SOURCES, Budget, Curves, Switch
 from foamfit.springs.chain import Chain
 from foamfit.springs.laws import BistableSpring, LinearSpring, MicroscaleSpring
 from foamfit.trust.checklist import input_first

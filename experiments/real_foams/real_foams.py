@@ -20,8 +20,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 import foamfit as ff
+from foamfit.parts import ParameterEstimate
 from foamfit.report.readable import readable
-from foamfit.results import Fit, ParameterEstimate
+from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

@@ -14,6 +14,7 @@ import lmfit
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.codec import plain
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.fitting.curves import check_time_shift, choose_drive
@@ -33,7 +34,7 @@ from foamfit.fitting.search import (
     what_stopped,
 )
 from foamfit.options import DRAWS, FREED, STARTS, STARTS_IN_SERIES, Given, Watch
-from foamfit.results import Fit, Intervals, plain
+from foamfit.results import Fit, Intervals
 from foamfit.solve.cache import SPENT
 from foamfit.springs.model import Model, with_options
 from foamfit.trust.best_point import BestPoint

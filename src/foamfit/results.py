@@ -11,13 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.codec import plain as plain
+from foamfit.codec import plain
 from foamfit.data.calibration import Contradiction
 from foamfit.data.cycles import cycles_of, loading_rate
 from foamfit.data.measurement import Measurement, interior_channel
-from foamfit.parts import Ladder
-from foamfit.parts import ParameterEstimate as ParameterEstimate
-from foamfit.parts import law_in_words as law_in_words
+from foamfit.parts import Ladder, ParameterEstimate, law_in_words
 from foamfit.springs.chain import Chain
 from foamfit.springs.spring import Spring
 

@@ -8,9 +8,9 @@ import pytest
 
 import fabricated
 import foamfit as ff
+from foamfit.parts import ParameterEstimate
 from foamfit.report.readable import readable
 from foamfit.report.summary import render_report
-from foamfit.results import ParameterEstimate
 
 NUISANCE = {
     "contact_time": (3.2e-6, 1.1e-6, "s", "contact time t₀", "µs"),

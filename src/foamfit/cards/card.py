@@ -25,15 +25,17 @@ from foamfit.cards.curves import (
     loading_curves,
     unloading_curve,
 )
+from foamfit.codec import plain
 from foamfit.data.cycles import loading_rate
 from foamfit.data.units import factor
 from foamfit.errors import InputError
 from foamfit.files import check_file, write_file
+from foamfit.parts import law_in_words
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, FITTED, SEEN, image
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import environment, words
-from foamfit.results import Fit, law_in_words, plain
+from foamfit.results import Fit
 from foamfit.study.identified import HasContent, read_source
 from foamfit.study.joint_result import JointResult
 from foamfit.study.saved import load

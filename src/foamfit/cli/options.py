@@ -76,7 +76,7 @@ def _fixes(
     return fixed or None
 
 
-# What the command reads otherwise than from the kind of an option.
+# Options whose values the command parses by a rule of its own, not by their kind.
 READ: dict[str, dict[str, Any]] = {
     "specimen": {"type": FILE},
     "cycle": {"type": str},

@@ -311,7 +311,7 @@ def rise_of(
 
 
 def _first_rise(values: Array, level: float) -> slice:
-    """Return the rows of the first rise up to a level, and as many before it as tell its start."""
+    """Return the rows of the first rise up to a level, and enough before it to find its start."""
     high = _first_above(values, level)
     below = np.flatnonzero(values[: high + 1] < _LOW * level)
     low = int(below[-1]) if below.size else 0

@@ -26,8 +26,8 @@ from foamfit.page.inputs import OF_CURVES, Inputs, models
 from foamfit.page.turning import Turning
 from foamfit.page.widgets import STYLE, TEMPLATES, WIDE, button, grid, piece, soft, text, wrong
 from foamfit.page.worker import FirstUse, News, parsed
+from foamfit.parts import law_in_words
 from foamfit.report.folder import load_result
-from foamfit.results import law_in_words
 from foamfit.springs.model import Model
 
 EXAMPLE = Path(__file__).with_name("example") / "foam.csv"

@@ -19,9 +19,9 @@ from foamfit.fitting.search import Tracker, rank
 from foamfit.fitting.starts import curve_starts, thinned
 from foamfit.one_model import Options
 from foamfit.options import Keywords
+from foamfit.parts import law_in_words
 from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
-from foamfit.results import law_in_words
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 
 WIDE = 4.0  # upper end of a slider, as a multiple of the value

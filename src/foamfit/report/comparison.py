@@ -19,13 +19,14 @@ from uncertainties import correlated_values_norm, nominal_value, std_dev, ufloat
 
 from foamfit.codec import build, reading
 from foamfit.errors import InputError
+from foamfit.parts import ParameterEstimate, law_in_words
 from foamfit.report import figures
 from foamfit.report.figures import TWO
 from foamfit.report.folder import load_result
 from foamfit.report.readable import readable
 from foamfit.report.render import sentences, words
 from foamfit.report.studies.parameters import Panel, plot_parameters
-from foamfit.results import Fit, ParameterEstimate, law_in_words
+from foamfit.results import Fit
 from foamfit.springs.laws import law
 from foamfit.springs.laws.record import ETA, RELAXATION_TIME, STRENGTH, Compared
 from foamfit.springs.model import Model

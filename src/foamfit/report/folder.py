@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from foamfit.arrays import Array
+from foamfit.codec import plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, reason, replacing
 from foamfit.report.figures import TWO
@@ -21,7 +22,7 @@ from foamfit.report.samples import FILE as SAMPLES
 from foamfit.report.samples import write_samples
 from foamfit.report.summary import render_report
 from foamfit.report.tables import numbers_of, parameters_tex, with_head
-from foamfit.results import SCHEMA, Fit, plain
+from foamfit.results import SCHEMA, Fit
 
 # Files of each kind of result, by the file that identifies it. They include files that only older
 # versions wrote, so that older folders can be replaced.

@@ -15,11 +15,11 @@ from foamfit.arrays import Array
 from foamfit.codec import build
 from foamfit.errors import InputError
 from foamfit.files import write_file
+from foamfit.parts import ParameterEstimate, law_in_words
 from foamfit.report.figures import tail
 from foamfit.report.folder import load_result
 from foamfit.report.render import page
 from foamfit.report.tables import MISFITS, by_test, varied
-from foamfit.results import ParameterEstimate, law_in_words
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, percent

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from foamfit.results import ParameterEstimate
+from foamfit.parts import ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
 from foamfit.text import number
 

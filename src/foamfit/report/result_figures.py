@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from foamfit.results import ParameterEstimate, Profile
+    from foamfit.parts import ParameterEstimate
+    from foamfit.results import Profile
 
 Mapped = Callable[..., Iterable[Any]]  # such as the built-in `map`
 # Widths of the figure of the fit in its page, which has its own title, and on a phone.

@@ -9,12 +9,13 @@ from typing import Any
 from foamfit.data.measurement import interior_channel
 from foamfit.fitting.branches import covered
 from foamfit.fitting.nuisance import POSITIVE
+from foamfit.parts import ParameterEstimate
 from foamfit.report.plots import origin_word
 from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page, sentences, table, words
 from foamfit.report.result_figures import Images, draw_all
 from foamfit.report.tables import count_determined
-from foamfit.results import STATED, Fit, ParameterEstimate
+from foamfit.results import STATED, Fit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, counted, percent, wrapped
 from foamfit.trust.covariance import RULE

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foamfit.codec import plain
+from foamfit.parts import ParameterEstimate
 from foamfit.report.readable import own_symbol, readable, readable_unit
 from foamfit.report.render import environment
-from foamfit.results import ParameterEstimate, plain
 from foamfit.springs.parameters import NUISANCE, springs_first
 
 if TYPE_CHECKING:

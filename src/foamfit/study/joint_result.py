@@ -15,17 +15,19 @@ import numpy as np
 
 from foamfit.api import FitResult
 from foamfit.arrays import Array
+from foamfit.codec import plain
 from foamfit.data.calibration import contradictions
 from foamfit.fitting.links import RATES
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.fitting.together import Together
+from foamfit.parts import ParameterEstimate
 from foamfit.report import render
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import check_target
 from foamfit.report.shown import JointViews
 from foamfit.report.studies.joint import save_joint
-from foamfit.results import SCHEMA, Fit, Loop, ParameterEstimate, loop_of, plain
+from foamfit.results import SCHEMA, Fit, Loop, loop_of
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, unit_of
 from foamfit.study.joint_fit import Alternative, JointFit

@@ -22,7 +22,8 @@ from foamfit.errors import SimulationError
 from foamfit.fitting import nuisance
 from foamfit.fitting.curves import later
 from foamfit.fitting.objective import Objective
-from foamfit.results import SOURCES, Budget, ParameterEstimate
+from foamfit.parts import ParameterEstimate
+from foamfit.results import SOURCES, Budget
 from foamfit.springs.parameters import NUISANCE
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, SINGULAR

@@ -21,7 +21,8 @@ from foamfit.errors import InputError
 from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.search import SearchRecord
-from foamfit.results import Check, Intervals, ParameterEstimate
+from foamfit.parts import ParameterEstimate
+from foamfit.results import Check, Intervals
 from foamfit.springs.parameters import NUISANCE, any_param, split_name
 from foamfit.trust import SENTENCES, say
 from foamfit.trust.best_point import BestPoint

@@ -19,7 +19,8 @@ from foamfit.fitting.branches import visited
 from foamfit.fitting.curves import MOTION_CURVES
 from foamfit.fitting.objective import MODEL_ERROR, Effort
 from foamfit.fitting.search import SearchRecord
-from foamfit.results import Correlation, Curves, Fit, Intervals, ParameterEstimate, Switch
+from foamfit.parts import ParameterEstimate
+from foamfit.results import Correlation, Curves, Fit, Intervals, Switch
 from foamfit.solve.cache import SPENT
 from foamfit.springs import laws
 from foamfit.springs.parameters import any_param, split_name, unit_of

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foamfit.codec import plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, write_file
+from foamfit.parts import ParameterEstimate
 from foamfit.report.figures import write_both
 from foamfit.report.listing import Listed, index_page, small_loop
 from foamfit.report.render import words
@@ -27,7 +29,7 @@ from foamfit.report.tables import (
     wide,
     with_head,
 )
-from foamfit.results import Fit, ParameterEstimate, plain
+from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, listed
 

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foamfit.codec import plain
+from foamfit.parts import ParameterEstimate
 from foamfit.report import figures
 from foamfit.report.figures import TWO
 from foamfit.report.folder import save_whole, write_json, write_result, write_table, write_text
@@ -21,7 +23,7 @@ from foamfit.report.shown import Shown, brief
 from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
 from foamfit.report.summary import CURVES
 from foamfit.report.tables import by_test, by_test_tex, frame, stacked, varied, wide
-from foamfit.results import Fit, ParameterEstimate, plain
+from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, percent
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foamfit.fitting.links import RATES, law_values
+from foamfit.parts import ParameterEstimate, law_in_words
 from foamfit.report import figures
 from foamfit.report.figures import FITTED, GREY, SEEN, TWO, VERMILION, image
 from foamfit.report.folder import save_whole, write_json, write_result, write_text
@@ -18,7 +19,7 @@ from foamfit.report.render import page, words
 from foamfit.report.shown import Joint
 from foamfit.report.studies.parameters import Panel, plot_parameters
 from foamfit.report.tables import MISFITS, formula, parameters_tex, symbols
-from foamfit.results import Fit, ParameterEstimate, law_in_words
+from foamfit.results import Fit
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import number, percent

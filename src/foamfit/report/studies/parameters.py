@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-    from foamfit.results import ParameterEstimate
+    from foamfit.parts import ParameterEstimate
 
 LEAST_PANEL, LETTER = 0.62, 0.052  # least width of a panel and width of a letter, inches
 TALLEST, ROW, ABOVE = 7.5, 0.17, 2.5  # heights of all panels, a row and the panel above, inches

@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foamfit.codec import plain
 from foamfit.data.measurement import Measurement
 from foamfit.data.rig import Candidate, Rig
+from foamfit.parts import law_in_words
 from foamfit.report import figures
 from foamfit.report import folder as results
 from foamfit.report.figures import BLUE, GREY, TWO, VERMILION
 from foamfit.report.readable import own_name
 from foamfit.report.render import page, sentences, words
-from foamfit.results import law_in_words, plain
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import unit_of
 from foamfit.text import engineering

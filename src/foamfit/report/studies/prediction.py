@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
+from foamfit.codec import plain
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
-from foamfit.parts import ParameterEstimate
+from foamfit.parts import ParameterEstimate, law_in_words
 from foamfit.report import figures
 from foamfit.report import folder as results
 from foamfit.report.figures import BLUE, FITTED, INSIDE, SEEN, TWO, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import words
-from foamfit.results import law_in_words, plain
 from foamfit.springs.model import Model
 from foamfit.text import percent
 

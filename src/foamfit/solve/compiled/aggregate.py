@@ -68,8 +68,8 @@ CLOSE = 1e-13  # relative difference of switching stresses below which springs s
 # springs. Then the polynomial; of each spring its branch, share of the height, and four shapes;
 # trees of the stresses at which springs leave their branches upwards, and of the negative ones at
 # which they leave them downwards; change, spring, branch left, branch entered and strain of each
-# switch. The second half of a tree holds the leaves, every entry before is the lesser of its two
-# children, and entry 1 is the least of all.
+# switch. The leaves are the second half of a tree. Each entry of the first half is the lesser of
+# its two children, so that entry 1 is the least of all.
 _NAMES = ("count", "leaves", "anchor", "unit", "least", "changes", "switches")
 HEAD = len(_NAMES)
 SPRINGS, OF_SPRING = HEAD + DEGREE + 1, 2 + 4 * SHAPE
@@ -250,10 +250,7 @@ def _place(shapes, heights, branches, log, time, stress, free, nodes):  # type: 
             done += 1
         place = 0.0
         for i in range(count):
-            shape, s = shapes[i, branches[i]], stress[j]
-            k = shape[STEEP]
-            part = s / (k + s) if shape[CURVED] > 0.0 else (s - shape[OFFSET]) / k
-            place += heights[i] * (shape[ORIGIN] + part)
+            place += heights[i] * _strain(shapes[i, branches[i]], stress[j])
             if i < count - 1:
                 nodes[i, j] = place
         if j >= free:

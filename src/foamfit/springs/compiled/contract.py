@@ -97,7 +97,7 @@ class Named(types.CPointer):  # type: ignore[misc]
 
     @property
     def key(self) -> str:
-        """What tells it from other types."""
+        """The name that distinguishes it from other types."""
         return self.name
 
 
@@ -111,7 +111,7 @@ class _Names(AttributeTemplate):  # type: ignore[misc]
     key = Named
 
     def generic_resolve(self, pointer: Any, name: str) -> Any:
-        """Return the type of a number, or None if there is none of this name."""
+        """Return the type of a named number, or None if the name is unknown."""
         return pointer.dtype if name in pointer.places else None
 
 
