@@ -32,7 +32,7 @@ from foamfit.report import render
 from foamfit.results import Fit
 from foamfit.springs import laws
 from foamfit.springs.model import Model, with_options
-from foamfit.springs.parameters import NUISANCE, family, split_name
+from foamfit.springs.parameters import split_name
 from foamfit.text import percent
 from foamfit.trust import evidence
 from foamfit.trust.checklist import input_first
@@ -97,38 +97,19 @@ def _dampers(params: lmfit.Parameters) -> list[str]:
     return [name for name in params if split_name(name)[1] == "eta" and params[name].vary]
 
 
-def _carry(params: lmfit.Parameters, model: Model, tried: Sequence[Tried]) -> None:
-    """Set the start values to the best fit of a model that this one contains; in place.
+def _below(model: Model, tried: Sequence[Tried]) -> int | None:
+    """Return the place of the best model with the same hysteretic springs, and nothing more."""
 
-    Springs are matched from the top. A new linear spring starts short and stiff, and a new
-    relaxation term with g = 0, so that the curves start as those of that fit.
-    """
-    inside = [
-        one
-        for one in tried
-        if Counter(Model.parse(one.result.model).kinds) <= Counter(model.kinds)
-        and one.result.relaxation <= model.relaxation
-    ]
-    if not inside:
-        return
-    below = min(inside, key=lambda one: one.chisqr).result
-    values, was = below.params.valuesdict(), list(Model.parse(below.model).kinds)
-    sources: dict[int, int] = {}
-    for spring in reversed(range(len(model.kinds))):
-        if was and model.kinds[spring] == was[-1]:
-            was.pop()
-            sources[spring] = len(was)
-    for name in (*NUISANCE, *model.names):
-        if name not in params or not params[name].vary:
-            continue
-        spring, short = split_name(name)
-        source = name if spring < 0 else f"s{sources.get(spring, -1) + 1}_{short}"
-        if source in values:
-            params[name].value = values[source]
-        elif spring in sources and family(short) == "g":
-            params[name].value = 0.0
-        elif spring >= 0 and spring not in sources and model.kinds[spring] == "linear":
-            params[name].value = params[name].min if short == "height" else 0.1 * params[name].max
+    def hysteretic(model: Model) -> list[str]:
+        return sorted(law.word or law.kind for law in model.laws if law.hysteretic)
+
+    def contained(other: Model) -> bool:
+        fewer = len(other.kinds) <= len(model.kinds) and other.relaxation <= model.relaxation
+        return fewer and hysteretic(other) == hysteretic(model)
+
+    models = [Model.parse(one.result.model, one.result.relaxation) for one in tried]
+    inside = [i for i, one in enumerate(models) if contained(one)]
+    return min(inside, key=lambda i: tried[i].chisqr, default=None)
 
 
 # ---------------------------------------------------------------- the comparison
@@ -271,7 +252,8 @@ class _Comparison:
         fit.
         """
         began, params = time.perf_counter(), self._params(model)
-        _carry(params, model, self.tried)
+        inside = _below(model, self.tried)
+        below = None if inside is None else self.fits[inside]
         if damping == "without":
             for name in _dampers(params):
                 params[name].set(value=0.0, vary=False)
@@ -283,7 +265,7 @@ class _Comparison:
 
         options = replace(self.options, max_time=left, relaxation=model.relaxation)
         look = self._look if len(model.kinds) > 1 else None
-        found = one_model.identify(self.measurement, model.name, params, options, tell, look)
+        found = one_model.identify(self.measurement, model.name, params, options, tell, look, below)
         (result, best), predicted = one_model.judge(found, COMPARED, lambda _: None), None
         if not result.stopped:
             with suppress(SearchStoppedError):

@@ -27,12 +27,15 @@ from foamfit.fitting.search import (
     SearchRecord,
     SearchStoppedError,
     Tracker,
+    distinct,
     ensure_feasible,
     has_several,
     leave_minimum,
+    rank,
     search,
     what_stopped,
 )
+from foamfit.fitting.starts import carried
 from foamfit.options import DRAWS, FREED, STARTS, STARTS_IN_SERIES, Given, Watch
 from foamfit.results import Fit, Intervals
 from foamfit.solve.cache import SPENT
@@ -52,6 +55,7 @@ from foamfit.trust.settle import (
     weigh_motion,
 )
 
+CARRIED = 8  # minima of a poorer model from which the search of a richer one begins
 Progress = Callable[[float, str], None]
 # Budget of the profiles, and of the ranges, as a multiple of the evaluations of the search, and the
 # largest number of restarts from a better point found by either.
@@ -183,6 +187,13 @@ class Found:
     tracker: Tracker
     record: SearchRecord
 
+    def minima(self) -> list[Array]:
+        """Return the best of the distinct minima that the search has met, the best one first."""
+        tracker, space = Tracker(self.problem.objective), self.problem.space()
+        ends = [*self.tracker.ends, *[x for x in [self.tracker.best_values] if x is not None]]
+        ranked = distinct(rank(tracker, space, [space.encode(values) for values in ends]))
+        return [space.decode(point) for _, point in ranked[:CARRIED]]
+
     def best(self) -> BestPoint:
         """Return the best point, with its springs in order.
 
@@ -215,8 +226,12 @@ def identify(
     options: Options,
     progress: Progress,
     look: Watch | None = None,
+    below: Found | None = None,
 ) -> Found:
-    """Search for the best point and refine it; `foamfit.fit` describes arguments and errors."""
+    """Search for the best point and refine it; `foamfit.fit` describes arguments and errors.
+
+    `below` is the fit of a model that this one contains, from whose minima the search begins.
+    """
     began = time.perf_counter()
     problem = options.problem(measurement, model, params)
     each = STARTS_IN_SERIES if has_several(problem.model) else STARTS
@@ -226,7 +241,8 @@ def identify(
     tracker = Tracker(problem.objective, deadline, better)
     tracker.looked = None if look is None else partial(look, problem)
     record = SearchRecord(options.seed, starts, began, compiled=SPENT.seconds)
-    problem, record = _search(problem, tracker, record, options.vary, progress)
+    known = [] if below is None else carried(problem.space(), below.problem.space(), below.minima())
+    problem, record = _search(problem, tracker, record, options.vary, progress, known)
     if tracker.best_values is None:
         tried, why = problem.objective.evaluations, "check the drive, the heights and the bounds"
         try:
@@ -310,8 +326,11 @@ def _search(
     record: SearchRecord,
     asked: Collection[str],
     progress: Progress,
+    known: Sequence[Array],
 ) -> tuple[Problem, SearchRecord]:
     """Search and refine; return the problem, and the record with costs and reason of a stop.
+
+    The search begins from points already `known`, if there are any.
 
     Along a given motion, contact and zeros are fitted after the search only: the first rise shows
     them to a fraction of a sample.
@@ -323,12 +342,13 @@ def _search(
     def search_thinned(problem: Problem) -> list[tuple[float, int]]:
         """Search on the thinned record; its ends become those of the tracker."""
         space = problem.space()
-        costs = search(coarse, space, starts=record.starts, rng=rng, progress=progress)
+        costs = search(coarse, space, starts=record.starts, rng=rng, progress=progress, known=known)
         reached = coarse.best_cost
-        exchange_springs(coarse, space)
+        if not known:  # else springs were exchanged before
+            exchange_springs(coarse, space)
         scan_places(coarse, space)
         if coarse.best_cost < (1.0 - NEWS) * reached:
-            leave_minimum(coarse, space)
+            leave_minimum(coarse, space, new=not known)
         best = [] if coarse.best_values is None else [coarse.best_values]
         tracker.ends += [*best, *coarse.ends]
         return costs

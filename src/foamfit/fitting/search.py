@@ -58,6 +58,7 @@ PROMISING = 100.0
 STAGES = ((12, 0.5, 0.5), (12, 0.25, 0.25), (36, 0.25, 0.25))
 HALFWAY = STAGES[0][2]
 LEAST = 6  # descents that go on in any case
+FEWER = 4  # divisor of the number of starts if a poorer model has found good ones
 
 
 class SearchStoppedError(Exception):
@@ -238,20 +239,25 @@ def distinct(ends: list[tuple[float, Array]]) -> list[tuple[int, Array]]:
 
 
 def search(
-    tracker: Tracker, space: Space, *, starts: int, rng: np.random.Generator, progress: Progress
-) -> list[tuple[float, int]]:
+    tracker: Tracker, space: Space, *, starts: int, rng: np.random.Generator, progress: Progress,
+    known: Sequence[Array] = (),
+) -> list[tuple[float, int]]:  # fmt: skip
     """Search for the best parameters, which the tracker keeps.
 
     `starts` descents begin on the smooth loop, and the best of their ends go on along the curves of
     the drive; `ATTEMPTS` says when this is repeated. Returns the final costs, best first, each with
-    the number of descents on the loop that led to it. Raises SearchStoppedError after the time
+    the number of descents on the loop that led to it. With points already `known`, which a poorer
+    model has found, there are fewer starts and one round. Raises SearchStoppedError after the time
     limit.
     """
     progress(0.0, "start values")
     points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
+    if known:
+        points += [space.encode(values) for values in known]
+        starts = max(starts // FEWER, LEAST)
     out: list[tuple[float, int]] = []
     several = has_several(space.model)
-    attempts, edges, left = ATTEMPTS + several, list[float](), np.inf
+    attempts, edges, left = 1 if known else ATTEMPTS + several, list[float](), np.inf
     for attempt in range(attempts):
         counts: dict[int, int] = {}
         if tracker.objective.measurement.displacement is not None:
@@ -271,7 +277,7 @@ def search(
         if attempt == 0:
             tracker.look()
         if tracker.best_cost < (1.0 - NEWS) * left:  # otherwise these points were tried before
-            edges, more = leave_minimum(tracker, space)
+            edges, more = leave_minimum(tracker, space, new=not known)
             out += more
             left = tracker.best_cost
         least = IN_SERIES if several else max(attempts // 2, 2 if edges else 1)
@@ -283,17 +289,21 @@ def search(
     return sorted(out)
 
 
-def leave_minimum(tracker: Tracker, space: Space) -> tuple[list[float], list[tuple[float, int]]]:
+def leave_minimum(
+    tracker: Tracker, space: Space, *, new: bool = True
+) -> tuple[list[float], list[tuple[float, int]]]:
     """Descend from points beside the best one; return costs off the edges of the box, and all.
 
-    The costs are those of `search`.
+    The costs are those of `search`. A minimum that is not `new`, but that of a poorer model, was
+    left before.
     """
     if tracker.best_values is None:
         return [], []
     edges, floor = list[float](), tracker.objective.floor
+    anywhere = new and len(space.model.kinds) > 1
     for _ in range(ATTEMPTS):
         before, best = tracker.best_cost, space.encode(tracker.best_values)
-        starts = off_edges(space, best, anywhere=before > floor and len(space.model.kinds) > 1)
+        starts = off_edges(space, best, anywhere=anywhere and before > floor)
         if before > floor:
             starts += neighbours(space, space.decode(best))
         edges += _descended(tracker, space, starts)

@@ -19,7 +19,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.fitting.box import Space
 from foamfit.springs.laws.record import Law, Param
 from foamfit.springs.loop import Loop
-from foamfit.springs.parameters import family, relaxation_names
+from foamfit.springs.parameters import family, relaxation_names, split_name
 
 LOOP_SAMPLES = 300
 CURVE_STARTS = 300
@@ -32,6 +32,9 @@ AROUND = 200  # random points around the best one
 EDGE, EDGE_MISSING, INSIDE = 0.02, 0.1, (0.35, 0.5, 0.65)
 # Changes of the logarithm of a parameter, and of a relaxation time, to leave a wrong minimum.
 APART, APART_IN_TIME = (1.2, -1.2), (3.0, -3.0, 4.8, -4.8)
+# Strength of relaxation terms that are new to a fitted model, and their times, as shares of the
+# time under load.
+WEAK, CARRIED_TIMES = 0.05, (0.01, 0.1, 0.5)
 # Strength of each new relaxation term, and the scales of parameters adjusted to it.
 ANEW, STIFF = 0.3, ("stress", "slope")
 
@@ -150,6 +153,38 @@ def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array
     ]  # fmt: skip
     low, high = np.array(limits).reshape(-1, 2).T
     return list(low + (high - low) * qmc.LatinHypercube(low.size, rng=rng).random(count))
+
+
+def carried(space: Space, below: Space, minima: Iterable[Array]) -> list[Array]:
+    """Return start points from the minima of a model that this one contains.
+
+    Springs are matched from the top. A new linear spring starts short and stiff, and new relaxation
+    terms are weak, of several times, so that the curves start nearly as those of that fit.
+    """
+    kinds, was = ([law.word or law.kind for law in one.model.laws] for one in (space, below))
+    sources = {}
+    for spring in reversed(range(len(kinds))):
+        if was and kinds[spring] == was[-1]:
+            was.pop()
+            sources[spring] = len(was)
+    out, index = list[Array](), {name: i for i, name in enumerate(below.names)}
+    for values, share in product(minima, CARRIED_TIMES if space.model.relaxation else (1.0,)):
+        start = space.values.copy()
+        for at, name in enumerate(space.names):
+            spring, short = split_name(name)
+            source = name if spring < 0 else f"s{sources.get(spring, -1) + 1}_{short}"
+            if name not in space.free:
+                continue
+            if source in index:
+                start[at] = values[index[source]]
+            elif spring in sources and family(short) in ("g", "tau"):
+                start[at] = WEAK if family(short) == "g" else share * space.scales.duration
+            elif spring >= 0 and spring not in sources and kinds[spring] == "linear":
+                start[at] = space.low[at] if short == "height" else 0.1 * space.high[at]
+        start = space.complete(start)
+        if not any(np.array_equal(start, other) for other in out):
+            out.append(start)
+    return out
 
 
 # ---------------------------------------------------------------- beside the best point
