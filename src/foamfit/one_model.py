@@ -317,7 +317,9 @@ def _assess(
         best = found.best()
         if tracker.best_cost < before / 1.02:  # a minimum that the search missed
             record = replace(record, costs=((tracker.best_cost, 1), *record.costs))
-    return best, record, Intervals(ranges=left.ranges)
+    minima = [*tracker.ends, *left.minima]
+    made = assess(best, choice, tracker, minima, 0.0, announce, left.ranges)
+    return best, record, replace(made, better=None, ranges=left.ranges)
 
 
 def _search(

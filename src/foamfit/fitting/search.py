@@ -310,7 +310,7 @@ def leave_minimum(
         if tracker.best_cost >= (1.0 - NEWS) * before:
             break
     out = [(cost, 1) for cost in edges]
-    if tracker.best_cost >= MISSING * floor:
+    if new and tracker.best_cost >= MISSING * floor:
         starts = apart(space, space.encode(tracker.best_values))
         out += [(cost, 1) for cost in _descended(tracker, space, starts)]
     if (reached := tracker.best_cost) >= MISSING * floor:
