@@ -240,7 +240,7 @@ def write_study(
     plain = {"model": model} | {k: v for k, v in settings.items() if k not in tables}
     text = [f"tests = [{', '.join(quoted(test) for test in tests)}]"]
     text += [f"{name} = {quoted(value)}" for name, value in plain.items()]
-    named = (name if re.match(r"s\d+_", name) else f"s1_{name}" for name in kinds)
+    named = (name if re.match(r"s\d+_|site_", name) else f"s1_{name}" for name in kinds)
     tables["parameters"] = dict(zip(named, kinds.values(), strict=True))
     for name, table in tables.items():
         text += ["", f"[{name}]", *(f"{key} = {quoted(value)}" for key, value in table.items())]
