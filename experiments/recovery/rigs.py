@@ -3,12 +3,10 @@
 Method and answer: README.md. Synthetic tests of four families are processed like a user's: impact
 and slow (`rig`), fault (impacts with a wrong number or channel, `faults`) and memory (three cycles,
 `cycles`). A row for each parameter contains true value and interval; a test that cannot be read or
-fitted gets a row with the message. With `--invariance` each impact is written in several ways, and
-the changes of the parameters are measured in standard errors.
+fitted gets a row with the message.
 
     python experiments/recovery/rigs.py --raw rows.csv         # 200 tests of each class, resumable
     python experiments/recovery/rigs.py --family slow --classes microscale --tests 20
-    python experiments/recovery/rigs.py --invariance --tests 20
 """
 
 from __future__ import annotations
@@ -18,7 +16,6 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -42,10 +39,9 @@ Row = dict[str, Any]
 Job = tuple[str, str, int]
 JOB = ["family", "class", "test"]
 COLUMNS = [
-    *JOB, "way", "rows", "parameter", "truth", "value", "low", "high", "stderr", "state", "holds",
-    "far", "move", "status", "over truth", "contradicted", "seconds", "error",
+    *JOB, "rows", "parameter", "truth", "value", "low", "high", "stderr", "state", "holds",
+    "far", "status", "over truth", "contradicted", "seconds", "error",
 ]  # fmt: skip
-AS_RECORDED = "as recorded"
 MISSED = 1.1  # misfit over that of the true springs at which a minimum was missed
 
 BOTH = ("force", "displacement")
@@ -196,49 +192,13 @@ def run_test(family: str, name: str, seed: int) -> list[Row]:
     return [about | judged(name, record.truth[name], one) for name, one in found if one.vary]
 
 
-def ways(record: Record) -> Iterator[tuple[str, Record]]:
-    """Write an impact in several ways, first as recorded."""
-    yield AS_RECORDED, record
-    if "displacement" in record.channels:
-        yield "zero", record.written_so(zero=0.7 * record.rig.height)
-        yield "zero back", record.written_so(zero=-2.3 * record.rig.height)
-    yield "clock", record.written_so(clock=12.7 - float(record.time[0]))
-    before = int(np.count_nonzero(record.time < record.truth["contact_time"]))
-    yield "half of the rows before", record.written_so(skip=before // 2)
-    yield "a tenth of the rows before", record.written_so(skip=before - before // 10)
-
-
-def run_invariance(family: str, name: str, seed: int) -> list[Row]:
-    """Fit one impact written in several ways; return a row per parameter and way, or failure."""
-    setup = FAMILIES[family][name]
-    record = impact(replace(setup, before=setup.before or 0.4), seed)
-    first: dict[str, Any] = {}
-    rows = []
-    for way, other in ways(record):
-        about: Row = {"family": family, "class": name, "test": seed, "way": way}
-        try:
-            found = fitted(other)[2]
-        except Exception as error:
-            rows.append(about | {"error": sentence(error)})
-            continue
-        first = first or found
-        for parameter, estimate in found.items():
-            error = first[parameter].stderr if parameter in first else None
-            if estimate.vary and error and parameter.startswith("s"):
-                move = abs(estimate.value - first[parameter].value) / error
-                rows.append(about | {"parameter": parameter, "move": move})
-    return rows
-
-
-def run(
-    work: Callable[[str, str, int], list[Row]], jobs: list[Job], raw: Path | None, processes: int
-) -> pd.DataFrame:
+def run(jobs: list[Job], raw: Path | None, processes: int) -> pd.DataFrame:
     """Run the jobs that are not yet in `raw`, and update it after each."""
     old = pd.read_csv(raw) if raw is not None and raw.exists() else pd.DataFrame(columns=COLUMNS)
     done = set(zip(*(old[key] for key in JOB), strict=True))
     left = [job for job in jobs if job not in done]
     tables = [old] if len(old) else []
-    for number, more in enumerate(studies.in_order(work, left, processes), start=1):
+    for number, more in enumerate(studies.in_order(run_test, left, processes), start=1):
         tables.append(pd.DataFrame(more, columns=COLUMNS).astype(object))
         if raw is not None:
             tables[-1].to_csv(raw, mode="a", index=False, header=not raw.exists())
@@ -283,29 +243,13 @@ def coverage(rows: pd.DataFrame, by: str) -> pd.DataFrame:
     return pd.DataFrame(out)
 
 
-def moves(rows: pd.DataFrame, by: str) -> pd.DataFrame:
-    """Count changes beyond 0.3 standard errors, for each value of a column and all together."""
-    out, rows = [], rows[rows["way"] != AS_RECORDED]
-    for name, group in [*rows.groupby(by, sort=False), ("all", rows)]:
-        given = group[group["move"].notna()]
-        worst = given.loc[given["move"].idxmax()] if len(given) else None
-        out.append({
-            by: name, "comparisons": len(given), "moved %": 100.0 * (given["move"] > 0.3).mean(),
-            "median": given["move"].median(), "largest": given["move"].max(),
-            "of": "" if worst is None else f"{worst['parameter']}, test {worst['test']}",
-            "failed": int(group["error"].notna().sum()),
-        })  # fmt: skip
-    return pd.DataFrame(out)
-
-
-def tell(rows: pd.DataFrame, invariance: bool) -> pd.DataFrame:
+def tell(rows: pd.DataFrame) -> pd.DataFrame:
     """Print the tables and the failures; return the table of classes."""
-    count = moves if invariance else coverage
-    table = count(rows, "class")
-    tables = [table, count(rows, "way" if invariance else "parameter")]
-    if not invariance and rows["class"].str.contains(" rows, ").any():  # the grid of slow tests
+    table = coverage(rows, "class")
+    tables = [table, coverage(rows, "parameter")]
+    if rows["class"].str.contains(" rows, ").any():  # the grid of slow tests
         grid = rows["class"].str.extract(r"(?P<law>.*), (?P<n>\d+ rows), (?P<noise>.* %)")
-        tables += [count(rows.assign(**grid).dropna(subset=name), name) for name in grid]
+        tables += [coverage(rows.assign(**grid).dropna(subset=name), name) for name in grid]
     for each in tables:
         print(each.to_string(index=False, float_format=lambda x: f"{x:.3g}"), end="\n\n")
     for name, test, error in rows[rows["error"].notna()][["class", "test", "error"]].to_numpy():
@@ -318,12 +262,10 @@ def main() -> None:
     parser.add_argument("--family", choices=[*FAMILIES], help="by default impact and slow")
     parser.add_argument("--classes", default="", help="a pattern that names of classes begin with")
     parser.add_argument("--first-seed", type=int, default=1)
-    parser.add_argument("--invariance", action="store_true", help="impacts written several ways")
     parser.add_argument("--raw", type=Path, help="rows of all tests; resumed")
     parser.add_argument("--out", type=Path, help="the table of classes")
     options = parser.parse_args()
     families = [options.family] if options.family else ["impact", "slow"]
-    families = ["impact"] if options.invariance else families
     jobs = [
         (family, name, seed)
         for seed in range(options.first_seed, options.first_seed + options.tests)
@@ -331,8 +273,8 @@ def main() -> None:
         for name in FAMILIES[family]
         if re.match(options.classes, name)
     ]
-    rows = run(run_invariance if options.invariance else run_test, jobs, options.raw, options.jobs)
-    table = tell(rows, options.invariance)
+    rows = run(jobs, options.raw, options.jobs)
+    table = tell(rows)
     if options.out is not None:
         table.to_csv(options.out, index=False, float_format="%.4g")
     print(studies.circumstances())

@@ -124,8 +124,9 @@ def test_a_failure_is_a_row_and_what_is_done_is_not_done_again(
     monkeypatch.setattr(ff, "fit", refuse)
     raw = tmp_path / "rows.csv"
     job = ("slow", "microscale, 300 rows, 0.3 %", 1)
-    rows = rigs.run(rigs.run_test, [job], raw, 1)
+    rows = rigs.run([job], raw, 1)
     assert list(rows["error"]) == ["InputError: the record is empty."]
     assert rigs.coverage(rows, "class")["failed"].tolist() == [1, 1]
-    again = rigs.run(pytest.fail, [job], raw, 1)
+    monkeypatch.setattr(rigs, "run_test", pytest.fail)
+    again = rigs.run([job], raw, 1)
     assert again["error"].tolist() == rows["error"].tolist()
