@@ -2,10 +2,13 @@
 
 Method and answer: README.md. All solvers of a scene alternate in one process, and processor time is
 measured, so that a busy machine affects all of them equally; ratios compare medians of one run. A
-table and a figure per scene and summary.csv go to `forward/`.
+table and a figure per scene and summary.csv go to `forward/`. With `--series` foamfit and SciPy are
+measured in a checkout of the last commit whose solver expands Taylor series; series.csv keeps the
+points, which are drawn after scaling by the times of SciPy in both runs.
 
     python experiments/error_vs_runtime/forward.py                      # all: about 5 minutes
     python experiments/error_vs_runtime/forward.py one_spring_impact    # some scenes, no page
+    PYTHONPATH=CHECKOUT/src python experiments/error_vs_runtime/forward.py --series
 """
 
 from __future__ import annotations
@@ -14,13 +17,13 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # processor time of one thread
 
-import contextlib
 import gc
 import sys
 import textwrap
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,42 +31,46 @@ import numpy as np
 import pandas as pd
 
 import foamfit as ff
-import rivals as kinds
-from rivals import KERNEL, PUBLIC, Competitor, Scene
+import rivals
+from rivals import HEYOKA, KERNEL, PUBLIC, SCIPY, Scene
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
-from studies import BLUE, GREEN, ORANGE, SKY, VERMILION
+from studies import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
 
 HERE = Path(__file__).parent
+SERIES, COMMIT = HERE / "forward" / "series.csv", "c076402b"
+BEFORE = "series: "  # of the names of its solvers
 WANTED = 2e-6  # the error at which solvers are compared
 ROUNDS = 40
 SHORTEST = 2e-3  # s; shorter runs are timed in groups
 BRIEF = 1e-2  # s; shorter runs are preceded by an untimed run
 SLOW = 1.0  # s; longer runs are made once
 FLOOR = 1e-16  # a zero error is drawn here
+TIMES = ["median (s)", "lower quartile (s)", "upper quartile (s)"]
 # Markers also distinguish solvers, besides colours.
 SOLVERS: dict[str, dict[str, Any]] = {
     PUBLIC: {"color": BLUE, "marker": "o", "linewidth": 1.6},
     KERNEL: {"color": VERMILION, "marker": "D", "linewidth": 1.6},
-    "SciPy DOP853": {"color": "black", "marker": "s"},
-    "SciPy LSODA": {"color": SKY, "marker": "^"},
-    "SciPy Radau": {"color": "#6b6b6b", "marker": "v"},
-    "velocity Verlet": {"color": ORANGE, "marker": "x", "linestyle": "--"},
-    "exponential recursion": {"color": ORANGE, "marker": "x", "linestyle": "--"},
-    "Runge-Kutta 4": {"color": GREEN, "marker": "+", "linestyle": "--"},
-}  # fmt: skip
+    BEFORE + PUBLIC: {"color": BLUE, "marker": "o", "linestyle": ":", "mfc": "none"},
+    BEFORE + KERNEL: {"color": VERMILION, "marker": "D", "linestyle": ":", "mfc": "none"},
+    HEYOKA: {"color": GREEN, "marker": "*", "markersize": 6},
+    f"{SCIPY} DOP853": {"color": BLACK, "marker": "s"},
+    f"{SCIPY} LSODA": {"color": SKY, "marker": "^"},
+    f"{SCIPY} Radau": {"color": ORANGE, "marker": "v"},
+}
 
 
 @dataclass
 class Timed:
-    """A competitor with its error and run times."""
+    """A solver at one tolerance with its error, an approximate time, and its measured times."""
 
-    competitor: Competitor
+    solver: str
+    tolerance: float
+    run: Callable[[], rivals.Answer]
     error: float
     first: float
     times: list[float] = field(default_factory=list)
-    runs: int = 0
 
     @property
     def at_once(self) -> int:
@@ -73,9 +80,14 @@ class Timed:
     def measure(self) -> None:
         """Time one run, or several short ones together."""
         if self.first < BRIEF:  # the previous run has displaced the caches
-            self.competitor.run()
-        self.times.append(seconds(self.competitor.run, self.at_once))
-        self.runs += self.at_once
+            self.run()
+        self.times.append(seconds(self.run, self.at_once))
+
+    def row(self) -> dict[str, Any]:
+        """Return a row of the table."""
+        quartiles = np.percentile(self.times or [self.first], [50, 25, 75])
+        found = {"solver": self.solver, "setting": f"rtol = {self.tolerance:.0e}"}
+        return found | {"error": self.error, **dict(zip(TIMES, quartiles, strict=True))}
 
 
 def seconds(run: Callable[[], object], times: int = 1) -> float:
@@ -87,54 +99,26 @@ def seconds(run: Callable[[], object], times: int = 1) -> float:
 
 
 def measure(scene: Scene, budget: float) -> pd.DataFrame:
-    """Return error and time of every competitor in a scene."""
-    truth, timed = kinds.reference(scene), list[Timed]()
-    for ladder in (kinds.own(scene) | kinds.others(scene)).values():
-        for competitor in ladder:
-            one = _first_run(competitor, truth)
-            if one is not None:
-                timed.append(one)
-                if one.first > scene.longest:
-                    break
-    _take_turns(timed, budget)
-    rows = [
-        (one.competitor.family, one.competitor.setting, one.error,
-         *np.percentile(one.times, [50, 25, 75]), one.runs)
-        for one in timed
-    ]  # fmt: skip
-    times = ["median (s)", "lower quartile (s)", "upper quartile (s)"]
-    return pd.DataFrame(rows, columns=["solver", "setting", "error", *times, "runs"])
+    """Return error and time of every solver in a scene at every tolerance."""
+    truth, timed = rivals.reference(scene), list[Timed]()
+    for solver, runs in rivals.solvers(scene).items():
+        for tolerance, run in runs.items():
+            try:
+                answer = run()  # compiles
+                first = seconds(run)
+            except (RuntimeError, ff.SimulationError):  # unstable, or past a pole
+                continue
+            error = rivals.error(answer, truth)
+            if error < 1.0:
+                timed.append(Timed(solver, tolerance, run, error, first))
+            if first > scene.longest:
+                break
+    take_turns(timed, budget)
+    return pd.DataFrame([one.row() for one in timed])
 
 
-def _first_run(competitor: Competitor, truth: kinds.Answer) -> Timed | None:
-    """Return error and approximate time; None if the run fails (unstable, or past a pole)."""
-    answers: list[kinds.Answer] = []
-    try:
-        first = seconds(lambda: answers.append(competitor.run()))
-        if first < SLOW:
-            first = seconds(competitor.run)
-    except (RuntimeError, ff.SimulationError):
-        return None
-    error = kinds.error(answers[0], truth)
-    if not error < 1.0:
-        return None
-    one = Timed(competitor, error, first)
-    if first >= SLOW:
-        one.times, one.runs = [first], 1
-    return one
-
-
-def compile_all() -> None:
-    """Run every kind of solver once, so that later runs do not compile."""
-    for scene in kinds.scenes():
-        many = scene.name.startswith("1000")  # only foamfit is fast here
-        for ladder in (kinds.own(scene) | ({} if many else kinds.others(scene))).values():
-            with contextlib.suppress(RuntimeError, ff.SimulationError):
-                ladder[0].run()
-
-
-def _take_turns(timed: list[Timed], budget: float) -> None:
-    """Time all competitors in turn, as often as each one's share of the budget (s) allows."""
+def take_turns(timed: list[Timed], budget: float) -> None:
+    """Time all solvers in turn, as often as each one's share of the budget (s) allows."""
     share = budget / len(timed)
     turns = [
         min(max(round(share / (one.first * one.at_once)), 3), ROUNDS) if one.first < SLOW else 0
@@ -149,21 +133,37 @@ def _take_turns(timed: list[Timed], budget: float) -> None:
     gc.enable()
 
 
-# ---------------------------------------------------------------- figures
+def with_series(tables: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """Add the stored points of the series solver, scaled by the times of SciPy in both runs."""
+    stored = pd.read_csv(SERIES)
+    now = pd.concat([table.assign(scene=name) for name, table in tables.items()])
+    both = now.merge(stored, on=["scene", "solver", "setting"], suffixes=("", " then"))
+    both = both[both["solver"].str.startswith(SCIPY)]
+    factor = float((both[TIMES[0]] / both[f"{TIMES[0]} then"]).median()) if len(both) else 1.0
+    stored[TIMES] *= factor
+    stored = stored[~stored["solver"].str.startswith(SCIPY)]
+    stored["solver"] = BEFORE + stored["solver"]
+    return {
+        name: pd.concat([table, stored[stored["scene"] == name].drop(columns="scene")])
+        for name, table in tables.items()
+    }
+
+
+# ---------------------------------------------------------------- figures and tables
 
 
 def draw_scene(table: pd.DataFrame, title: str, path: Path) -> None:
     """Plot error over median time of every solver of a scene, with quartiles of time."""
-    with studies.sheet(path, 5.2, 3.1) as figure:
+    with studies.sheet(path, 5.6, 3.1) as figure:
         ax = figure.add_subplot()
         ax.axhline(WANTED, color="0.75", linewidth=0.8, zorder=0)
         for solver, look in SOLVERS.items():
             part = table[table["solver"] == solver]
             if len(part):
-                middle = part["median (s)"]
-                spread = [middle - part["lower quartile (s)"], part["upper quartile (s)"] - middle]
+                middle, low, high = (part[name] for name in TIMES)
                 look = {"linewidth": 1.0, "markersize": 4, **look}
                 error = part["error"].clip(lower=FLOOR)
+                spread = [middle - low, high - middle]
                 ax.errorbar(middle, error, xerr=spread, elinewidth=0.6, label=solver, **look)
         ax.set(xscale="log", yscale="log", xlabel="processor time of one run (s)")
         ax.set(ylim=(FLOOR / 3, 1.0), yticks=[10.0**k for k in range(-16, 1, 2)])
@@ -177,33 +177,18 @@ def draw_scene(table: pd.DataFrame, title: str, path: Path) -> None:
         figure.legend(loc="outside right center")
 
 
-# ---------------------------------------------------------------- tables
-
-
-def cheapest(table: pd.DataFrame, family: str) -> pd.Series | None:
-    """Return the fastest setting of a family (name prefix) with an error below WANTED."""
-    part = table[table["solver"].str.startswith(family) & (table["error"] < WANTED)]
-    return part.loc[part["median (s)"].idxmin()] if len(part) else None
-
-
 def compare(scene: Scene, table: pd.DataFrame) -> dict[str, object]:
-    """Return one row of the summary: foamfit against the best other solvers at WANTED."""
-    fixed = table[~table["solver"].str.startswith(("foamfit", "SciPy"))]
-    best = {
-        "simulate": cheapest(table, PUBLIC),
-        "kernel": cheapest(table, KERNEL),
-        "SciPy": cheapest(table, "SciPy"),
-        "fixed step": cheapest(fixed, ""),
-    }
-    row: dict[str, object] = {"scene": scene.title}
-    for name, item in best.items():
-        row[f"{name} (s)"] = np.nan if item is None else item["median (s)"]
-        if name in ("SciPy", "fixed step"):
-            how = "none reaches it" if item is None else f"{item['solver']}, {item['setting']}"
-            row[f"best {name}"] = how.removeprefix("SciPy ")
-    for other in ("SciPy", "fixed step"):
-        for name in ("simulate", "kernel"):
-            row[f"{other} / {name}"] = row[f"{other} (s)"] / row[f"{name} (s)"]
+    """Return one row of the summary: the fastest setting of each solver with an error < WANTED."""
+    reached, row = table[table["error"] < WANTED], dict[str, object](scene=scene.title)
+    columns = {
+        "simulate": PUBLIC, "kernel": KERNEL, "series: simulate": BEFORE + PUBLIC,
+        "series: kernel": BEFORE + KERNEL, "SciPy": SCIPY, "heyoka": HEYOKA,
+    }  # fmt: skip
+    for column, family in columns.items():
+        part = reached[reached["solver"].str.startswith(family)]
+        row[f"{column} (s)"] = part[TIMES[0]].min()
+    for name in ("simulate", "kernel"):
+        row[f"SciPy / {name}"] = row["SciPy (s)"] / row[f"{name} (s)"]
     return row
 
 
@@ -211,28 +196,39 @@ def main() -> None:
     """Measure and draw the scenes; write the page if all were asked for."""
     parser = studies.arguments(__doc__, HERE, budget=(6.0, "seconds of turns a scene"))
     parser.add_argument("scenes", nargs="*", help="names; left out = all, and the page")
+    parser.add_argument("--series", action="store_true", help="write series.csv alone")
     options = parser.parse_args()
-    folder = options.out / "forward"
+    folder, wanted = options.out / "forward", rivals.scenes()
+    if options.scenes:
+        wanted = [scene for scene in wanted if scene.name in options.scenes]
     folder.mkdir(parents=True, exist_ok=True)
-    compile_all()
-    rows, figures = [], []
-    for scene in kinds.scenes():
-        if options.scenes and scene.name not in options.scenes:
-            continue
-        table = measure(scene, options.budget)
+    tables = dict[str, pd.DataFrame]()
+    for scene in wanted:
+        tables[scene.name] = measure(scene, options.budget)
+        print(scene.name, file=sys.stderr)
+    if options.series:
+        rows = pd.concat([table.assign(scene=name) for name, table in tables.items()])
+        studies.write_csv(rows[["scene", *rows.columns.drop("scene")]], SERIES)
+        return
+    tables, rows, figures = with_series(tables), [], []
+    for scene in wanted:
+        table = tables[scene.name]
         studies.write_csv(table, folder / f"{scene.name}.csv")
         draw_scene(table, scene.title, folder / f"{scene.name}.png")
         figures.append(f"![Error against run time: {scene.title}](forward/{scene.name}.png)")
         rows.append(compare(scene, table))
-        ratios = (f"{name} {rows[-1][f'SciPy / {name}']:.3g}" for name in ("simulate", "kernel"))
-        print(scene.name, "SciPy over", *ratios, file=sys.stderr)
     if options.scenes:
+        print(studies.shown(pd.DataFrame(rows)))
         return
-    studies.write_csv(rows, folder / "summary.csv")
+    summary = pd.DataFrame(rows)
+    studies.write_csv(summary, folder / "summary.csv")
+    faster = summary["kernel (s)"] / summary["series: kernel (s)"]
+    optional = [HEYOKA] if find_spec(HEYOKA) else []
     studies.write_page(
-        HERE, options.out, wanted=f"{WANTED:g}", table=studies.shown(pd.DataFrame(rows)),
-        where=studies.circumstances("NumPy", "SciPy", "numba", "foamfit"),
-        figures="\n\n".join(figures),
+        HERE, options.out, wanted=f"{WANTED:g}", table=studies.shown(summary),
+        faster=(faster.min(), faster.max()),
+        where=studies.circumstances("NumPy", "SciPy", "numba", "foamfit", *optional),
+        figures="\n\n".join(figures), commit=COMMIT,
     )  # fmt: skip
 
 

@@ -6,42 +6,36 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-import fixed_step
 import foamfit as ff
-import restarted
-import restarted_memory
-import written_law
 from foamfit.solve.plan import plan
 from foamfit.springs.chain import Drive
 
 sys.path.append(str(Path(__file__).parents[1] / "stability"))
 import independent
+import with_scipy
 
 Array = np.ndarray
 Answer = tuple[Array, Array]  # displacement of the top (m) and base stress (Pa), (n,) each
-# Fixed-step schemes by number of steps, and SciPy's integrators by method and rtol.
-Rivals = tuple[dict[str, Callable[[int], Answer]], Callable[[str, float], Answer]]
 
 SAMPLES, LENGTH = 501, 0.8e-3
 MASS = 7e-3
 MODEL_2, MODEL_3 = ff.published["foam-1/model-2"], ff.published["foam-1/model-3"]
 HEIGHT, AREA = MODEL_2.chain.height, MODEL_2.chain.area
 
-PUBLIC, KERNEL = "foamfit simulate", "foamfit kernel"
+PUBLIC, KERNEL, SCIPY, HEYOKA = "foamfit simulate", "foamfit kernel", "SciPy", "heyoka"
 
 
 @dataclass(frozen=True)
 class Scene:
     """A chain under a drive, and the settings of each solver.
 
-    `own` and `outside` are tolerances of foamfit and of SciPy, `substeps` the steps of fixed-step
-    schemes between two samples. No setting is tried after one that takes `longest` (s). `looks` is
-    that of `restarted.impact`.
+    `own` and `outside` are tolerances of foamfit and of SciPy; without the latter SciPy is left
+    out. No setting is tried after one that takes `longest` (s). `looks` is that of `with_scipy`.
     """
 
     name: str
@@ -51,7 +45,6 @@ class Scene:
     time: Array
     own: Sequence[float] = tuple(10.0**-k for k in range(2, 13))
     outside: Sequence[float] = tuple(10.0**-k for k in range(3, 13))
-    substeps: Sequence[int] = tuple(2**k for k in range(11))
     longest: float = 0.3
     looks: int = 0
 
@@ -97,9 +90,7 @@ def scenes() -> list[Scene]:
         ),
         Scene(
             "1000_springs_impact", "1000 springs, impact at 2.2 m/s", graded(1000),
-            ff.Impact(MASS, 2.2), t, own=(1e-6, 1e-10), outside=(1e-7, 1e-8, 1e-10, 1e-11),
-            substeps=(1, 4, 16), longest=4.0,
-            looks=4,
+            ff.Impact(MASS, 2.2), t, own=(1e-6, 1e-10), outside=(), longest=4.0,
         ),
         *_with_memory(),
     ]  # fmt: skip
@@ -124,7 +115,7 @@ def _with_memory() -> list[Scene]:
         Scene(
             "microscale_relaxation_displacement",
             "one microscale spring with a relaxation term, displacement drive of two cycles",
-            ff.Chain([slow], [height], area), ff.DisplacementDrive(motion), pressed,
+            ff.Chain([slow], [height], area), ff.DisplacementDrive(motion), pressed, outside=(),
         ),
         Scene(
             "linear_microscale_relaxation_impact",
@@ -135,23 +126,12 @@ def _with_memory() -> list[Scene]:
     ]  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Competitor:
-    """One solver at one setting."""
-
-    family: str
-    setting: str
-    run: Callable[[], Answer]
+def solvers(scene: Scene) -> dict[str, dict[float, Callable[[], Answer]]]:
+    """Return all solvers of a scene, and the runs of each by tolerance."""
+    return own(scene) | by_scipy(scene) | by_heyoka(scene)
 
 
-def _ladder(
-    family: str, run: Callable[[Any], Answer], values: Sequence[Any], text: str = "rtol = {:.0e}"
-) -> dict[str, list[Competitor]]:
-    """Return a solver at several settings."""
-    return {family: [Competitor(family, text.format(v), partial(run, v)) for v in values]}
-
-
-def own(scene: Scene) -> dict[str, list[Competitor]]:
+def own(scene: Scene) -> dict[str, dict[float, Callable[[], Answer]]]:
     """Return foamfit's solvers: `simulate`, and the bare `Plan.run` that a fit calls."""
     made = plan(scene.chain, scene.drive, scene.time)
     rows, heights = scene.chain.arrays.rows, scene.chain.arrays.heights
@@ -164,73 +144,33 @@ def own(scene: Scene) -> dict[str, list[Competitor]]:
         motion = made.run(rows, heights, rtol, everything=False)
         return motion.displacement[-1], motion.base_stress
 
-    return _ladder(PUBLIC, public, scene.own) | _ladder(KERNEL, kernel, scene.own)
+    return {
+        name: {rtol: partial(run, rtol) for rtol in scene.own}
+        for name, run in ((PUBLIC, public), (KERNEL, kernel))
+    }
 
 
-def others(scene: Scene) -> dict[str, list[Competitor]]:
-    """Return the fixed-step schemes and SciPy's integrators."""
-    if not isinstance(scene.chain.springs[-1], ff.MicroscaleSpring):
-        fixed, outside = _bistable(scene)
-    elif isinstance(scene.drive, ff.Impact):
-        fixed, outside = _microscale_impact(scene)
-    else:
-        fixed, outside = _microscale_displacement(scene)
-    out, steps = dict[str, list[Competitor]](), [n * (scene.time.size - 1) for n in scene.substeps]
-    for name, run in fixed.items():
-        out |= _ladder(name, run, steps, "{} steps")
-    for method in restarted.METHODS:
-        out |= _ladder(f"SciPy {method}", partial(outside, method), scene.outside)
-    return out
+def by_scipy(scene: Scene) -> dict[str, dict[float, Callable[[], Answer]]]:
+    """Return SciPy's integrators."""
+    if not scene.outside:
+        return {}
+    impact = with_scipy.Impact(scene.chain, scene.drive, scene.time)
+    return {
+        f"{SCIPY} {method}": {
+            rtol: partial(impact.run, method, rtol, scene.looks) for rtol in scene.outside
+        }
+        for method in with_scipy.METHODS
+    }
 
 
-def _bistable(scene: Scene) -> Rivals:
-    rows, heights, t = written_law.rows_of(scene.chain), np.array(scene.chain.heights), scene.time
-    made = plan(scene.chain, scene.drive, t)
+def by_heyoka(scene: Scene) -> dict[str, dict[float, Callable[[], Answer]]]:
+    """Return heyoka, if it is installed and the scene is an impact on one bistable spring."""
+    if scene.name != "one_spring_impact" or find_spec("heyoka") is None:
+        return {}
+    import with_heyoka
 
-    def fixed(scheme: int, steps: int) -> Answer:
-        out = np.zeros(t.size), np.zeros(t.size)
-        given = rows, heights, np.array(made.ends), made.mass, made.drag, made.speed, t
-        fixed_step.impact(*given, steps // (t.size - 1), scheme, *out)
-        return out
-
-    def outside(method: str, rtol: float) -> Answer:
-        system = restarted.System(rows, heights, made.mass, made.drag, made.speed)
-        return restarted.impact(system, t, method, rtol, scene.looks)
-
-    return {name: partial(fixed, k) for k, name in enumerate(fixed_step.NAMES)}, outside
-
-
-def _microscale_impact(scene: Scene) -> Rivals:
-    """Return solvers of a microscale spring, alone or on a linear one."""
-    t, drive = scene.time, scene.drive
-    row = restarted_memory.row_of(scene.chain, drive.mass)
-
-    def fixed(steps: int) -> Answer:
-        out = np.zeros(t.size), np.zeros(t.size)
-        restarted_memory.runge_kutta(row, drive.velocity, t, steps // (t.size - 1), *out)
-        return out
-
-    def outside(method: str, rtol: float) -> Answer:
-        system = restarted_memory.MemorySystem(row, drive.velocity)
-        return restarted.impact(system, t, method, rtol, scene.looks)
-
-    return {"Runge-Kutta 4": fixed}, outside
-
-
-def _microscale_displacement(scene: Scene) -> Rivals:
-    t, row = scene.time, restarted_memory.row_of(scene.chain)
-    motion = np.array(scene.drive.displacement)
-    eps = motion / scene.chain.height
-
-    def by_hand(steps: int) -> Answer:
-        out = np.zeros(t.size)
-        restarted_memory.recursion(row, t, eps, steps // (t.size - 1), out)
-        return motion, out
-
-    def outside(method: str, rtol: float) -> Answer:
-        return motion, restarted_memory.along_displacement(row, t, eps, method, rtol)
-
-    return {"exponential recursion": by_hand}, outside
+    given = scene.chain, scene.drive, scene.time
+    return {HEYOKA: {tol: with_heyoka.Impact(*given, tol).run for tol in (*scene.own, 1e-15)}}
 
 
 def reference(scene: Scene) -> Answer:

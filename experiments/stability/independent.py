@@ -82,7 +82,7 @@ class System(NamedTuple):
     speed: float  # of a striker, else 0
     gravity: float  # on a striker
     values: Array  # of the drive at the samples
-    work: Array  # (4, n), overwritten by `_rates`
+    work: Array  # (4, n), overwritten by `fill_rates`
 
 
 class Flags(NamedTuple):
@@ -299,7 +299,7 @@ def _ends(p: Array, branch: int, rank: float, most: float) -> tuple[float, float
 
 
 @inner
-def _rates(
+def fill_rates(
     y: Array, out: Array, stress: Array, flags: Flags, system: System, value: float, rate: float
 ) -> bool:
     """Fill the rates `out` of a state and the `stress` of each group.
@@ -399,7 +399,7 @@ def _rates(
 
 
 @inner
-def _over(
+def overshoot(
     y: Array, rates: Array, paces: Array, flags: Flags, system: System, base: float, peak: float
 ) -> float:
     """Return the overshoot of a state past a branch end, turn or contact; negative if none.
@@ -433,7 +433,7 @@ def _leaps(y: Array, y1: Array, moving: int, flags: Flags, springs: Array) -> bo
 
 
 @inner
-def _enter(y: Array, rates: Array, moving: int, flags: Flags, springs: Array) -> int:
+def enter_branches(y: Array, rates: Array, moving: int, flags: Flags, springs: Array) -> int:
     """Change the branch of each spring that leaves it or reverses; return their number."""
     moved = 0
     for i in range(flags.branch.size):
@@ -477,7 +477,7 @@ def _step(
                 total += _A[stage, m] * k[m, j]
             y1[j] = y[j] + h * total
         at = value + rate * _C[stage] * h
-        if not _rates(y1, k[stage], one.stress, flags, system, at, rate):
+        if not fill_rates(y1, k[stage], one.stress, flags, system, at, rate):
             return math.inf
     largest = np.zeros(3)
     for j in range(size):
@@ -507,10 +507,10 @@ def _past(
     y: Array, h: float, one: Tried, flags: Flags, system: System, value: float, rate: float,
     tol: float, peak: float,
 ) -> float:  # fmt: skip
-    """Take a step and return its overshoot past a switch; see `_over`."""
+    """Take a step and return its overshoot past a switch; see `overshoot`."""
     _step(y, h, one, flags, system, value, rate, tol)
-    _rates(one.y1, one.rates, one.stress, flags, system, value + rate * h, rate)
-    return _over(one.y1, one.rates, one.paces, flags, system, one.stress[0], peak)
+    fill_rates(one.y1, one.rates, one.stress, flags, system, value + rate * h, rate)
+    return overshoot(one.y1, one.rates, one.paces, flags, system, one.stress[0], peak)
 
 
 @inner
@@ -556,10 +556,10 @@ def _suspect(
                     first = min(first, _C[stage])
     if lifts:  # rates of the base stress at both ends, by finite differences
         tiny, base0, base1, other = 1e-5 * h, stress[0], one.stress[0], np.empty(stress.size)
-        _rates(y + tiny * k[0], one.scale, other, flags, system, value + tiny * rate, rate)
+        fill_rates(y + tiny * k[0], one.scale, other, flags, system, value + tiny * rate, rate)
         d0 = (other[0] - base0) / tiny
         at_end = value + rate * h - tiny * rate
-        _rates(y1 - tiny * f1, one.scale, other, flags, system, at_end, rate)
+        fill_rates(y1 - tiny * f1, one.scale, other, flags, system, at_end, rate)
         d1 = (base1 - other[0]) / tiny
         if d0 < 0.0 < d1:
             x = _turn(-base0, -d0, -base1, -d1, h)
@@ -569,7 +569,7 @@ def _suspect(
 
 
 @inner
-def _record(
+def record_samples(
     y: Array, moving: int, flags: Flags, springs: Array, times: Array, now: float, done: int,
     pressure: float, nodes: Array, base: Array,
 ) -> int:  # fmt: skip
@@ -633,8 +633,10 @@ def _follow(
         # samples that are due, with the preceding rate of the drive
         if done < times.size and times[done] <= now and not fresh:
             value += rate * (now - since)
-            if _rates(y, one.k[0], stress, flags, system, value, rate):
-                done = _record(y, moving, flags, springs, times, now, done, stress[0], nodes, base)
+            if fill_rates(y, one.k[0], stress, flags, system, value, rate):
+                done = record_samples(
+                    y, moving, flags, springs, times, now, done, stress[0], nodes, base
+                )
         # the drive from here on
         since = now
         if not struck:
@@ -644,20 +646,20 @@ def _follow(
             if fresh and times.size > 1:
                 rate = (values[knot + 1] - values[knot]) / (times[knot + 1] - times[knot])
             value = values[knot] + rate * (now - times[knot])
-        if not _rates(y, one.k[0], stress, flags, system, value, rate):
+        if not fill_rates(y, one.k[0], stress, flags, system, value, rate):
             return DONE if done == times.size else FLAT, steps, switches, math.nan, least
         if fresh and not struck and knot > 0 and top == MOTION:  # dashpots see the mean rate
             a, b = times[knot] - times[knot - 1], times[knot + 1] - times[knot]
             base[knot] += a / (a + b) * (stress[0] - base[knot])
         fresh = False
-        moved = _enter(y, one.k[0], moving, flags, springs)
+        moved = enter_branches(y, one.k[0], moving, flags, springs)
         if moved:
             switches += moved
             steps += 1
             if steps > most:
                 return TOO_LONG, steps, switches, math.nan, least
             continue
-        done = _record(y, moving, flags, springs, times, now, done, stress[0], nodes, base)
+        done = record_samples(y, moving, flags, springs, times, now, done, stress[0], nodes, base)
         if done == times.size:
             return DONE, steps, switches, math.nan, least
         largest, peak = max(largest, np.abs(stress).max()), max(peak, stress[0])
@@ -696,10 +698,10 @@ def _follow(
         grow = min(0.9 * max(error, 1e-30) ** -0.125, 6.0)
         following = max(full, h * grow) if h < full else h * grow
         # does a branch or contact end in this step?
-        if not _rates(one.y1, one.rates, one.stress, flags, system, value + rate * h, rate):
+        if not fill_rates(one.y1, one.rates, one.stress, flags, system, value + rate * h, rate):
             return FLAT, steps, switches, math.nan, least
         lifts = peak if pressed and stress[0] > 0.0 else 0.0
-        past = _over(one.y1, one.rates, one.paces, flags, system, one.stress[0], lifts)
+        past = overshoot(one.y1, one.rates, one.paces, flags, system, one.stress[0], lifts)
         high_at = 1.0
         if past <= 0.0:
             first = _suspect(y, stress, h, one, flags, system, value, rate, lifts > 0.0)
@@ -710,7 +712,7 @@ def _follow(
         hit = past > 0.0
         if hit:  # find its length by false position and bisection alternately
             lands, low_at = False, 0.0
-            low_past = min(_over(y, one.k[0], one.paces, flags, system, stress[0], lifts), 0.0)
+            low_past = min(overshoot(y, one.k[0], one.paces, flags, system, stress[0], lifts), 0.0)
             high_past = past
             for turn in range(80):
                 if high_past <= 1e-16 or high_at - low_at <= 1e-15 * high_at:
@@ -746,7 +748,7 @@ def _follow(
             now = total
         h = following
         if hit:
-            _rates(y, one.rates, one.stress, flags, system, value + rate * length, rate)
+            fill_rates(y, one.rates, one.stress, flags, system, value + rate * length, rate)
             for i in range(count):
                 branch, ranks = flags.branch[i], (flags.ranks[i], flags.most[i])
                 low, high, _, _ = _ends(springs[i], branch, ranks[0], ranks[1])
@@ -759,7 +761,7 @@ def _follow(
                 break
     # after contact the chain moves with the striker, without load
     for j in range(done, times.size):
-        _record(
+        record_samples(
             y, moving, flags, springs, times[j : j + 1], math.inf, 0, 0.0, nodes[:, j:], base[j:]
         )
         nodes[:, j] += (times[j] - now) * (y[groups - 1] + 0.5 * system.gravity * (times[j] - now))
@@ -802,13 +804,13 @@ def over_range(one: Array, other: Array) -> float:
     return miss / span if span > 0.0 and math.isfinite(miss) else math.inf
 
 
-def _fastest(rows: Array, ends: Integers, mass: Array, top: int) -> float:
+def _fastest(system: System) -> float:
     """Return the largest rate (1/s) at which dashpots stop a mass; it limits explicit steps."""
-    hold = []
+    hold, rows, ends = [], system.springs, system.ends
     for first, last in zip([0, *ends[:-1]], ends, strict=True):
         eta, height = rows[first:last, ETA], rows[first:last, H]
         hold.append(1.0 / float((height / eta).sum()) if (eta > 0.0).all() else 0.0)
-    known = mass if top == MASS else mass[:-1]
+    known = system.mass if system.top == MASS else system.mass[:-1]
     return max(
         ((hold[g] + (hold[g + 1] if g + 1 < len(hold) else 0.0)) / m for g, m in enumerate(known)),
         default=0.0,
@@ -844,17 +846,15 @@ def has_memory(chain: Any) -> bool:
     return any(hasattr(s, "sigma_plus") or getattr(s, "relaxation", ()) for s in chain.springs)
 
 
-def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = MOST_WORK) -> Truth:
-    """Follow a scene once, at one tolerance, without an estimate of the uncertainty."""
-    count = len(chain.springs)
+def system_of(chain: Any, drive: Any, time: Array) -> tuple[System, Integers]:
+    """Return the constants of a run and the initial branches."""
     pairs = [row_of(s, h) for s, h in zip(chain.springs, chain.heights, strict=True)]
     rows, kinds = np.array([row for row, _ in pairs]), np.array([kind for _, kind in pairs])
     relaxing = [list(getattr(spring, "relaxation", ())) for spring in chain.springs]
-    relax = np.tile([0.0, 1.0], (count, max(map(len, relaxing)), 1))
+    relax = np.tile([0.0, 1.0], (len(pairs), max(map(len, relaxing)), 1))
     for i, terms in enumerate(relaxing):
         for n, term in enumerate(terms):
             relax[i, n] = term
-    time = np.ascontiguousarray(time, float)
     above, values, top = float(chain.masses[-1]), np.zeros(time.size), MASS
     speed, gravity = float(getattr(drive, "velocity", 0.0)), float(getattr(drive, "gravity", 0.0))
     drag = chain.site_damping / math.fsum(chain.heights)
@@ -865,19 +865,25 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = 
     else:
         values = np.array(drive.stress, float)
         top = MASS if above > 0.0 else DAMPER if drag > 0.0 else STRESS
-    inside = [i for i in range(count - 1) if chain.masses[i] > 0.0]
-    ends = np.array([*(i + 1 for i in inside), count])
-    mass = np.array([*(chain.masses[i] for i in inside), above]) / chain.area
-    nodes, base = np.zeros((count, time.size)), np.zeros(time.size)
     if values[0] != 0.0:
         raise ValueError("a drive must start at zero")
+    inside = [i for i in range(len(pairs) - 1) if chain.masses[i] > 0.0]
+    ends = np.array([*(i + 1 for i in inside), len(pairs)])
+    mass = np.array([*(chain.masses[i] for i in inside), above]) / chain.area
+    work = np.empty((4, len(pairs)))
+    return System(rows, relax, ends, mass, drag, top, speed, gravity, values, work), kinds
+
+
+def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = MOST_WORK) -> Truth:
+    """Follow a scene once, at one tolerance, without an estimate of the uncertainty."""
+    count, time = len(chain.springs), np.ascontiguousarray(time, float)
+    system, kinds = system_of(chain, drive, time)
+    nodes, base = np.zeros((count, time.size)), np.zeros(time.size)
     if not has_memory(chain):
-        too_long = _fastest(rows, ends, mass, top) * (time[-1] - time[0]) > 6.0 * most / count
-        if too_long or _shares(chain, drive, ends):
+        too_long = _fastest(system) * (time[-1] - time[0]) > 6.0 * most / count
+        if too_long or _shares(chain, drive, system.ends):
             why = WHY[TOO_LONG] if too_long else SHARED
             return Truth(nodes, base, None, math.nan, math.nan, math.inf, 0, 0, why)
-    work = np.empty((4, count))
-    system = System(rows, relax, ends, mass, drag, top, speed, gravity, values, work)
     outcome, steps, switches, end, dip = _follow(
         system, kinds, time, tol, most // count, nodes, base
     )
