@@ -35,7 +35,7 @@ class Scene:
     """A chain under a drive, and the settings of each solver.
 
     `own` and `outside` are tolerances of foamfit and of SciPy; without the latter SciPy is left
-    out. No setting is tried after one that takes `longest` (s). `looks` is that of `with_scipy`.
+    out. No setting is tried after one that takes `longest` (s).
     """
 
     name: str
@@ -46,7 +46,6 @@ class Scene:
     own: Sequence[float] = tuple(10.0**-k for k in range(2, 13))
     outside: Sequence[float] = tuple(10.0**-k for k in range(3, 13))
     longest: float = 0.3
-    looks: int = 0
 
 
 def graded(count: int, mass: float = 0.0, eta: float = 0.0) -> ff.Chain:
@@ -86,7 +85,7 @@ def scenes() -> list[Scene]:
             "10_springs_mass_impact",
             "10 springs with dashpots of 2 Pa·s and 9 masses between, impact at 2.2 m/s",
             graded(10, MODEL_2.specimen_mass, 2.0), ff.Impact(MASS, 2.2), t,
-            outside=rtol, looks=4, longest=0.6,
+            outside=rtol, longest=0.6,
         ),
         Scene(
             "1000_springs_impact", "1000 springs, impact at 2.2 m/s", graded(1000),
@@ -156,9 +155,7 @@ def by_scipy(scene: Scene) -> dict[str, dict[float, Callable[[], Answer]]]:
         return {}
     impact = with_scipy.Impact(scene.chain, scene.drive, scene.time)
     return {
-        f"{SCIPY} {method}": {
-            rtol: partial(impact.run, method, rtol, scene.looks) for rtol in scene.outside
-        }
+        f"{SCIPY} {method}": {rtol: partial(impact.run, method, rtol) for rtol in scene.outside}
         for method in with_scipy.METHODS
     }
 

@@ -115,11 +115,10 @@ class Impact:
         strains = np.where(self.kinds < HELD, 1.0, stiff)  # a microscale spring moves by its stress
         self.scale[nodes : nodes + self.kinds.size] = strains
 
-    def run(self, method: str, rtol: float, looks: int = 0) -> tuple[Array, Array]:
+    def run(self, method: str, rtol: float) -> tuple[Array, Array]:
         """Return displacement of the striker and base stress at the samples.
 
-        Switches are detected at the samples, at the ends of steps, and at `looks` points inside
-        steps: with vibrating masses, a spring may leave its branch and return within a step.
+        Switches are detected at the samples and at the ends of steps.
         """
         count, self.y, self.done, self.peak = self.kinds.size, self.first.copy(), 0, 0.0
         self.flags = Flags(self.kinds.copy(), np.full(count, -math.inf), np.full(count, -math.inf))
@@ -128,34 +127,26 @@ class Impact:
         for _ in range(MOST_SWITCHES):
             enter(self.y, self.flags, self.system)
             with np.errstate(all="ignore"):  # a stage past a pole: the step is rejected
-                now, ended = self._phase(now, method, rtol, looks)
+                now, ended = self._phase(now, method, rtol)
             if ended:
                 return self.nodes[-1], self.base
         raise RuntimeError(f"{method}: too many switches at rtol = {rtol:g}")
 
-    def _phase(self, now: float, method: str, rtol: float, looks: int) -> tuple[float, bool]:
+    def _phase(self, now: float, method: str, rtol: float) -> tuple[float, bool]:
         """Continue to the next switch; return its time, and whether samples or contact end."""
         branch, ranks, most = self.flags
         solver: Any = METHODS[method](
             lambda _, y: self.rates(y, branch, ranks, most), now, self.y, float(self.time[-1]),
             rtol=rtol, atol=rtol * self.scale,
         )  # fmt: skip
-        inside = np.arange(1, looks + 1) / (looks + 1)
         while solver.status == "running":
             message = solver.step()
             if solver.status == "failed" or not np.isfinite(solver.y).all():
                 raise RuntimeError(f"{method}: {message or 'not finite'}")
             last = int(np.searchsorted(self.time, solver.t, side="right"))
-            times, dense = np.append(self.time[self.done : last], solver.t), None
-            if looks or last > self.done:
-                dense = solver.dense_output()
+            times = np.append(self.time[self.done : last], solver.t)
+            dense = solver.dense_output() if last > self.done else None
             states = dense(times) if dense else solver.y[:, None]
-            for at in (solver.t_old + inside * (solver.t - solver.t_old)) if looks else ():
-                if passed(dense(at)[:, None], self.flags, self.system, self.peak)[0] == 0:
-                    before = int(np.searchsorted(times, at))
-                    times, states = np.append(times[:before], at), dense(times)[:, : before + 1]
-                    states[:, before] = dense(at)
-                    break
             first, _, largest = passed(states, self.flags, self.system, self.peak)
             if first >= 0:
                 dense = dense or solver.dense_output()

@@ -1,8 +1,8 @@
 """How does wear change a running-shoe foam? Five specimens each of a new and a worn heel.
 
-Method and answer: README.md. Also written: batch.csv, wear.csv and a figure.
+Method and answer: README.md. Also written: wear.csv and a figure.
 
-    FOAMFIT_DATA=… python experiments/twins/twins.py    # --page: from the tables alone
+    FOAMFIT_DATA=… python experiments/twins/twins.py    # --page: from the table alone
 """
 
 from __future__ import annotations
@@ -30,12 +30,14 @@ from studies import BLUE, GREY, VERMILION
 HERE = Path(__file__).parent
 SOURCE = "Measurements: arXiv:2602.12694, LivingMatterLab/CANN"
 GROUPS, COLOURS = ("new", "worn"), {"new": BLUE, "worn": VERMILION}
+CYCLES = range(1, 7)
 FIRST, LATER = 1, 5  # cycles with tables on the page
-LAW = [*studies.MICROSCALE, "g1", "tau1"]
 # A single test cannot separate kc and eps_star (r = 1.00), but the evidence of all ten favours one
 # common eps_star. It is fitted to all tests and fixed in the groups, so that kc can be compared.
 HELD = "s1_eps_star"
-SCATTERING = tuple(f"s1_{name}" for name in LAW if f"s1_{name}" != HELD)
+SCATTERING = tuple(
+    f"s1_{name}" for name in (*studies.MICROSCALE, "g1", "tau1") if f"s1_{name}" != HELD
+)
 ENERGY, PEAK = "dissipated energy", "peak stress"
 UNITS = {ENERGY: (1e3, "kJ/m³"), PEAK: (1e3, "kPa")}
 LEVEL = 0.05  # significance level, for all comparisons of a cycle together
@@ -48,19 +50,8 @@ Loops = Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]]
 
 
 def measure(folder: Path) -> None:
-    """Fit each cycle of each test, then each group jointly; write batch.csv and wear.csv."""
-    found = ff.batch(
-        folder, out=folder / "runs", model="microscale", relaxation=1, drive="displacement",
-        cycle="all", intervals="local", report=False,
-    )  # fmt: skip
-    split = found["test"].str.extract(r"^(?P<specimen>.*)_raw(?:/cycle-(?P<cycle>\d+))?$")
-    table = pd.concat([split, found.drop(columns=["test", "file"])], axis=1)
-    errors = [name for name in table if name.endswith("_stderr")]
-    studies.write_csv(table.drop(columns=errors), HERE / "batch.csv", 5)
-    counts = table["cycle"].dropna().astype(int).value_counts()
-    # Ignore a cycle that only few records contain.
-    full = sorted(n for n, count in counts.items() if count == table["specimen"].nunique())
-    frames = [wear(fit_together(folder, n), loops(folder, n)).assign(cycle=n) for n in full]
+    """Fit each group jointly in each cycle; write wear.csv."""
+    frames = [wear(fit_together(folder, n), loops(folder, n)).assign(cycle=n) for n in CYCLES]
     rows = pd.concat(frames)
     studies.write_csv(rows[["cycle", *rows.columns.drop("cycle")]], HERE / "wear.csv")
 
@@ -248,31 +239,13 @@ def change_rows(changes: pd.DataFrame) -> str:
     return studies.lines(cells(one) for one in changes.itertuples())
 
 
-def batch_rows(table: pd.DataFrame) -> str:
-    """Return, by group and cycle, numbers of fits, misfits and determined parameters."""
-    rows = []
-    groups = table.groupby([table["specimen"].str.split("-").str[0], "cycle"], dropna=False)
-    for (group, cycle), part in groups:
-        off = part["misfit_stress_strain"].dropna()
-        spread = f"{percent(off.min())} to {percent(off.max())}" if len(off) else "–"
-        acceptable = part["status"].isin(["ok", "warnings"]).sum()
-        states = (part[f"s1_{name}_state"].eq("determined").sum() for name in LAW)
-        rows.append([group, cycle, f"{acceptable} of {len(part)}", spread, *states])
-    return studies.lines(rows)
-
-
 def write(measured: Loops) -> None:
-    """Write figure and page from the tables."""
-    table, changes = pd.read_csv(HERE / "batch.csv"), pd.read_csv(HERE / "wear.csv")
+    """Write figure and page from the table."""
+    changes = pd.read_csv(HERE / "wear.csv")
     draw(changes, measured, HERE / "new_against_worn.png")
-    off, out = table["misfit_stress_strain"], changes["p_adjusted"] < LEVEL
-    everywhere = out.groupby(changes["quantity"]).all()
+    everywhere = (changes["p_adjusted"] < LEVEL).groupby(changes["quantity"]).all()
     studies.write_page(
-        HERE, first=FIRST, later=LATER, last=changes["cycle"].max(), fits=len(table),
-        fitted=int(table["status"].isin(["ok", "warnings"]).sum()),
-        misfit_low=percent(off.min()), misfit_high=percent(off.max()),
-        misfit_median=percent(off.median()), batch=batch_rows(table),
-        names=" | ".join(f"`{name}`" for name in LAW), dashes=" | ".join("---" for _ in LAW),
+        HERE, first=FIRST, later=LATER, last=changes["cycle"].max(),
         everywhere=", ".join(everywhere.index[everywhere]) or "nothing",
         wear_first=change_rows(changes[changes["cycle"] == FIRST]),
         wear_later=change_rows(changes[changes["cycle"] == LATER]),
