@@ -1,7 +1,6 @@
 """What is the overhead of `foamfit batch`? Speed-up, overhead per test, memory.
 
-Method and answer: README.md, whose numbers are in batch.json. Other work on the machine slows
-everything, so processor times are given with wall-clock times.
+Method and answer: README.md, whose numbers are in batch.json.
 
     python experiments/batch/batch.py               # all, some 15 minutes on two idle cores
     python experiments/batch/batch.py speedup       # one of them; see MEASURES
@@ -22,7 +21,6 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-import pandas as pd
 
 import foamfit as ff
 from foamfit.study import batch_work
@@ -60,7 +58,7 @@ def make_tests(folder: Path, count: int, samples: int, linear: bool = False) -> 
 def watched(
     place: Path, *words: object, note: Callable[[Any], None] = lambda _: None
 ) -> dict[str, float]:
-    """Run the command; return wall time and processor times of start and busiest process.
+    """Run the command; return wall time, and processor times of the start and of all processes.
 
     The start is the command itself and the process that forks the others. `note` is called with the
     process of the command, ten times a second.
@@ -79,38 +77,27 @@ def watched(
                     times = one.cpu_times()
                     cpu[one.pid] = one.pid in first, times.user + times.system
                 note(whole)
-    wall = time.perf_counter() - began
-    workers = [used for is_first, used in cpu.values() if not is_first]
     return {
-        "wall_s": wall,
+        "wall_s": time.perf_counter() - began,
         "start_cpu_s": sum(used for is_first, used in cpu.values() if is_first),
-        "busiest_cpu_s": max(workers, default=0.0),
         "all_cpu_s": sum(used for _, used in cpu.values()),
     }
 
 
 def measure_speedup(place: Path, *words: str) -> dict[str, Any]:
-    """Compare one process with two, and check that the numbers agree.
-
-    On a busy machine wall time means little. The processor time of start plus busiest process is
-    the critical path of a batch.
-    """
+    """Compare one process with two, and check that the numbers agree."""
     make_tests(place / "tests", TESTS, 601)
-    took = {}
+    took, values = {}, {}
     for jobs in (1, 2):
-        took[jobs] = watched(place, "--jobs", jobs, "--out", f"out-{jobs}", *words)
-    one, two = (
-        [p.read_bytes() for p in sorted((place / f"out-{j}").glob("*/parameters.csv"))]
-        for j in (1, 2)
-    )
-    way = {jobs: took[jobs]["start_cpu_s"] + took[jobs]["busiest_cpu_s"] for jobs in took}
+        out = place / f"out-{jobs}"
+        took[jobs] = watched(place, "--jobs", jobs, "--out", out.name, *words)
+        values[jobs] = [file.read_bytes() for file in sorted(out.glob("*/parameters.csv"))]
     return {
         "tests": TESTS,
         "one": took[1],
         "two": took[2],
         "share of ideal (clock)": took[1]["wall_s"] / (2.0 * took[2]["wall_s"]),
-        "share of ideal (processor time of the longest way)": way[1] / (2.0 * way[2]),
-        "same numbers": one == two and len(one) == TESTS,
+        "same numbers": values[1] == values[2] and len(values[1]) == TESTS,
     }
 
 
@@ -134,24 +121,17 @@ def measure_overhead(place: Path) -> dict[str, Any]:
         finally:
             fits[0] += time.process_time() - began
 
-    paths = sorted((place / "tests").iterdir())
+    paths, count = sorted((place / "tests").iterdir()), TINY - 20
     with patch.object(batch_work, "fit", fit):
-        for path in paths[:20]:  # then everything is loaded
-            work(task(path, place / "foam.toml", recipe, place / "out" / path.stem))
-        fits[0], began = 0.0, time.process_time()
-        for path in paths[20:]:
+        for i, path in enumerate(paths):
+            if i == 20:  # everything is loaded
+                fits[0], began = 0.0, time.process_time()
             work(task(path, place / "foam.toml", recipe, place / "out" / path.stem))
         spent = time.process_time() - began
-    count = TINY - 20
-    out = watched(place, "--starts", 1, "--no-report", "--jobs", 1, "--out", "whole")
-    fitted = pd.read_csv(place / "whole" / "summary.csv")["runtime_s"].sum()
     return {
         "tests": count,
         "fit_ms": 1e3 * fits[0] / count,
         "beside_ms": 1e3 * (spent - fits[0]) / count,
-        "whole command, beside its fits, per test, start included (clock, ms)": 1e3
-        * (out["wall_s"] - fitted)
-        / TINY,
     }
 
 
