@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import re
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -126,16 +127,21 @@ def oscillation(drive: Drive, mass: float, damper: float) -> dict[str, float]:
 def damper_needed(drive: Drive, mass: float = OWN_MASS, share: float = TURN) -> float:
     """Return the least onsite damper (Pa·s) that removes extra turns of stress and motion."""
 
-    def turns(damper: float) -> int:
-        got = driven(drive, mass, damper)
-        return extra_turns(got.base_stress, drive.stress, share) + extra_turns(
-            got.displacement[-1], drive.displacement, share
+    def calm(log_damper: float) -> bool:
+        got = driven(drive, mass, math.exp(log_damper))
+        return not (
+            extra_turns(got.base_stress, drive.stress, share)
+            + extra_turns(got.displacement[-1], drive.displacement, share)
         )
 
-    low, high = 0.1, 1000.0
-    while high / low > 1.01:
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if turns(middle) > 0 else (low, middle)
+    return math.exp(least(calm, math.log(0.1), math.log(1000.0), math.log(1.01)))
+
+
+def least(enough: Callable[[float], bool], low: float, high: float, close: float) -> float:
+    """Return the least value, to within `close`, that is enough: not `low`, but `high`."""
+    while high - low > close:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if enough(middle) else (middle, high)
     return high
 
 
@@ -242,19 +248,10 @@ def spring_strain(chain: ff.Chain, got: ff.Response) -> Array:
     return (got.displacement[-1] - below) / chain.heights[-1]
 
 
-def closes(chain: ff.Chain, velocity: float) -> bool:
-    """Return whether the bistable spring reaches branch c."""
-    return bool(np.any(struck(chain, velocity).switches[:, 3] == BRANCH_NAMES.index("c")))
-
-
 def closing_velocity(name: str, interior: bool = True) -> float:
-    """Return the least velocity (m/s) at which the impact reaches C1, by bisection."""
-    chain = impact_scene(name, interior)
-    low, high = 1.0, 8.0
-    while high - low > 1e-6:
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if closes(chain, middle) else (middle, high)
-    return high
+    """Return the least velocity (m/s) at which the impact reaches branch c."""
+    chain, c = impact_scene(name, interior), BRANCH_NAMES.index("c")
+    return least(lambda v: bool(np.any(struck(chain, v).switches[:, 3] == c)), 1.0, 8.0, 1e-6)
 
 
 def work_to_c1(name: str) -> float:
@@ -284,12 +281,16 @@ def loop_area(name: str) -> float:
     return float(item.chain.heights[-1] * np.trapezoid(stress, strain))
 
 
+def rebound(got: ff.Response) -> float:
+    """Return the velocity (m/s) of the striker after contact."""
+    return -float(np.diff(got.displacement[-1])[-1] / np.diff(got.time)[-1])
+
+
 def energy_row(name: str, interior: bool = True) -> dict[str, float]:
     """Compare the simulated published impact of one set with its loop; SI."""
     item, chain = ff.published[name], impact_scene(name, interior)
     velocity = item.striker_velocity
     got = struck(chain, velocity, 4001)
-    flight = np.diff(got.displacement[-1])[-1] / np.diff(got.time)[-1]
     brought = 0.5 * STRIKER * velocity**2 / chain.area
     needed = closing_velocity(name, interior)
     return {
@@ -298,7 +299,7 @@ def energy_row(name: str, interior: bool = True) -> dict[str, float]:
         "left": float(spring_strain(chain, got)[np.searchsorted(got.time, got.contact_end)]),
         "c1": item.bistable.eps_hat_c,
         "peak": float(np.max(got.base_stress)),
-        "rebound": -float(flight),
+        "rebound": rebound(got),
         "needed": needed,
         "needed_energy": closing_velocity_by_energy(name),
         "excess": 100.0 * ((needed / velocity) ** 2 - 1.0),
@@ -310,9 +311,7 @@ def energy_row(name: str, interior: bool = True) -> dict[str, float]:
 
 def lost_share(chain: ff.Chain, velocity: float) -> float:
     """Return the share (%) of the striker's energy that is lost."""
-    got = struck(chain, velocity)
-    flight = np.diff(got.displacement[-1])[-1] / np.diff(got.time)[-1]
-    return float(100.0 * (1.0 - (flight / velocity) ** 2))
+    return 100.0 * (1.0 - (rebound(struck(chain, velocity)) / velocity) ** 2)
 
 
 def published_viscosity() -> dict[str, float]:
