@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -591,11 +591,10 @@ def record_samples(
 def _follow(
     system: System, kinds: Integers, times: Array, tol: float, most: int,
     nodes: Array, base: Array,
-) -> tuple[int, int, int, float, float]:  # fmt: skip
+) -> tuple[int, int, float]:  # fmt: skip
     """Follow a chain over the samples; fill in displacements and base stress.
 
-    Return the kind of end, the number of steps and switches, the end of contact (NaN if none), and
-    the least minimum of the base stress before it over its maximum.
+    Return the kind of end, the number of steps, and the end of contact (NaN if none).
     """
     springs, values, top = system.springs, system.values, system.top
     count, groups = springs.shape[0], system.ends.size
@@ -623,8 +622,8 @@ def _follow(
             )
             base[done] = 0.0
             done += 1
-    knot, steps, switches, peak, largest = 0, 0, 0, 0.0, 0.0
-    pressed, least, last_base, falling = False, math.inf, 0.0, False
+    knot, steps, peak, largest = 0, 0, 0.0, 0.0
+    pressed = False
     h = rate = 0.0
     value = system.gravity * system.mass[groups - 1]
     late = 0.0  # rounding error of the clock
@@ -647,28 +646,21 @@ def _follow(
                 rate = (values[knot + 1] - values[knot]) / (times[knot + 1] - times[knot])
             value = values[knot] + rate * (now - times[knot])
         if not fill_rates(y, one.k[0], stress, flags, system, value, rate):
-            return DONE if done == times.size else FLAT, steps, switches, math.nan, least
+            return DONE if done == times.size else FLAT, steps, math.nan
         if fresh and not struck and knot > 0 and top == MOTION:  # dashpots see the mean rate
             a, b = times[knot] - times[knot - 1], times[knot + 1] - times[knot]
             base[knot] += a / (a + b) * (stress[0] - base[knot])
         fresh = False
-        moved = enter_branches(y, one.k[0], moving, flags, springs)
-        if moved:
-            switches += moved
+        if enter_branches(y, one.k[0], moving, flags, springs):
             steps += 1
             if steps > most:
-                return TOO_LONG, steps, switches, math.nan, least
+                return TOO_LONG, steps, math.nan
             continue
         done = record_samples(y, moving, flags, springs, times, now, done, stress[0], nodes, base)
         if done == times.size:
-            return DONE, steps, switches, math.nan, least
+            return DONE, steps, math.nan
         largest, peak = max(largest, np.abs(stress).max()), max(peak, stress[0])
         pressed = pressed or (struck and stress[0] > RISEN * largest)
-        if pressed:
-            if stress[0] > last_base and falling:
-                least = min(least, last_base / peak)
-            falling = stress[0] < last_base
-            last_base = stress[0]
         for j in range(size):
             one.reach[j] = max(one.reach[j], abs(y[j]))
         for i in range(count):
@@ -680,7 +672,7 @@ def _follow(
         while True:  # until a step is short enough
             steps += 1
             if steps > most:
-                return TOO_LONG, steps, switches, math.nan, least
+                return TOO_LONG, steps, math.nan
             full = h
             lands = h >= left
             if lands:
@@ -694,12 +686,12 @@ def _follow(
                 break
             h *= max(0.9 * error**-0.125, 0.2) if error < math.inf else 0.1
             if now + 1e-3 * h == now and h < 1e-22:
-                return NO_STEP, steps, switches, math.nan, least
+                return NO_STEP, steps, math.nan
         grow = min(0.9 * max(error, 1e-30) ** -0.125, 6.0)
         following = max(full, h * grow) if h < full else h * grow
         # does a branch or contact end in this step?
         if not fill_rates(one.y1, one.rates, one.stress, flags, system, value + rate * h, rate):
-            return FLAT, steps, switches, math.nan, least
+            return FLAT, steps, math.nan
         lifts = peak if pressed and stress[0] > 0.0 else 0.0
         past = overshoot(one.y1, one.rates, one.paces, flags, system, one.stress[0], lifts)
         high_at = 1.0
@@ -765,7 +757,7 @@ def _follow(
             y, moving, flags, springs, times[j : j + 1], math.inf, 0, 0.0, nodes[:, j:], base[j:]
         )
         nodes[:, j] += (times[j] - now) * (y[groups - 1] + 0.5 * system.gravity * (times[j] - now))
-    return DONE, steps, switches, now, least
+    return DONE, steps, now
 
 
 # ------------------------------------------------------------------------------------ the judge
@@ -775,24 +767,23 @@ def _follow(
 class Truth:
     """Result of the judge for a scene.
 
-    Attributes ---------- displacement : (n_springs, n_t) array m. base_stress : (n_t,) array Pa.
-    contact_end : float or None s. unsure : float Largest difference from the run at the looser
-    tolerance, over the range of each curve. unsure_end : float Difference of the ends of contact
-    over their time; infinite if only one run has an end. dip : float Least minimum of the base
-    stress before the end of contact, over its maximum. If it is below a tolerance, a solution
-    within this tolerance may end contact there. steps, switches : int Of the run at the tighter
-    tolerance. why : str Reason if there is no judgement, else "".
+    Attributes
+    ----------
+    displacement : (n_springs, n_t) array, m
+    base_stress : (n_t,) array, Pa
+    contact_end : float or None, s
+    steps : int, of the run at the tighter tolerance
+    why : str, reason if there is no judgement, else ""
+    unsure : float, largest difference from the run at the looser tolerance, over the range of each
+        curve; NaN if there was none
     """
 
     displacement: Array
     base_stress: Array
     contact_end: float | None
-    unsure: float
-    unsure_end: float
-    dip: float
-    steps: int
-    switches: int
+    steps: int = 0
     why: str = ""
+    unsure: float = math.nan
 
 
 def over_range(one: Array, other: Array) -> float:
@@ -883,15 +874,12 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = 
         too_long = _fastest(system) * (time[-1] - time[0]) > 6.0 * most / count
         if too_long or _shares(chain, drive, system.ends):
             why = WHY[TOO_LONG] if too_long else SHARED
-            return Truth(nodes, base, None, math.nan, math.nan, math.inf, 0, 0, why)
-    outcome, steps, switches, end, dip = _follow(
-        system, kinds, time, tol, most // count, nodes, base
-    )
+            return Truth(nodes, base, None, why=why)
+    outcome, steps, end = _follow(system, kinds, time, tol, most // count, nodes, base)
     why = WHY[outcome]
     if not why and not (np.isfinite(nodes).all() and np.isfinite(base).all()):
         why = "not finite"
-    end = None if math.isnan(end) else end
-    return Truth(nodes, base, end, math.nan, math.nan, dip, steps, switches, why)
+    return Truth(nodes, base, None if math.isnan(end) else end, steps, why)
 
 
 def judge(
@@ -908,15 +896,7 @@ def judge(
     loose = by(chain, drive, time, LOOSE, most)
     if loose.why:
         return loose
-    unsure = max(
-        max(over_range(a, b) for a, b in zip(loose.displacement, tight.displacement, strict=True)),
-        over_range(loose.base_stress, tight.base_stress),
-    )
-    if tight.contact_end is None or loose.contact_end is None:
-        end = 0.0 if tight.contact_end is loose.contact_end else math.inf
-    else:
-        end = abs(loose.contact_end / tight.contact_end - 1.0)
-    return Truth(
-        tight.displacement, tight.base_stress, tight.contact_end, unsure, end,
-        min(tight.dip, loose.dip), tight.steps, tight.switches,
-    )  # fmt: skip
+    pairs = zip(loose.displacement, tight.displacement, strict=True)
+    apart = max(over_range(one, other) for one, other in pairs)
+    apart = max(apart, over_range(loose.base_stress, tight.base_stress))
+    return replace(tight, unsure=apart)

@@ -148,4 +148,4 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = 0.0, most: int = 0)
             nodes[:, j] = np.cumsum([float(h * e) for h, e in zip(heights, strains, strict=True)])
             for p in springs:
                 p.keep(s)
-    return Truth(nodes, base, None, 0.0, 0.0, 1.0, 0, 0)
+    return Truth(nodes, base, None)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from scipy.stats import qmc
 import foamfit as ff
 
 Array = NDArray[np.float64]
+Scene = tuple[ff.Chain, ff.Impact | ff.StressDrive | ff.DisplacementDrive, Array]
+Spec = dict[str, Any]  # a scene that JSON can hold; see `families`
 
 AREA, STRIKER = 1.9635e-5, 7e-3  # m², kg: the specimens and the striker of the paper
 HISTORIES = ("on a", "on d", "on c", "on e", "loops", "all branches")
@@ -112,9 +115,7 @@ def turns_of(point: Point) -> Array:
     return np.array([0.0, *turns[point.history]])
 
 
-def scene_of(
-    point: Point,
-) -> tuple[ff.Chain, ff.Impact | ff.StressDrive | ff.DisplacementDrive, Array]:
+def scene_of(point: Point) -> Scene:
     """Return chain, drive and samples of a scene."""
     chain = chain_of(point)
     time = np.linspace(0.0, duration_of(point), point.samples)
@@ -137,6 +138,29 @@ def scene_of(
         share = share / chain.height
     motion = np.interp(time, along, fine) * chain.height * share
     return chain, ff.DisplacementDrive(motion), time
+
+
+def scene_from(spec: Spec) -> Scene:
+    """Return chain, drive and samples."""
+    if "point" in spec:
+        return scene_of(Point(**spec["point"]))
+    springs = [
+        (ff.MicroscaleSpring if "sigma_plus" in s else
+         ff.BistableSpring if "kc" in s else ff.LinearSpring)(**s)
+        for s in spec["springs"]
+    ]  # fmt: skip
+    chain = ff.Chain(springs, spec["heights"], spec["area"], spec["masses"], spec["site"])
+    grid = np.linspace(0.0, spec["stop"], spec["samples"])
+    if "impact" in spec:
+        return chain, ff.Impact(*spec["impact"]), grid
+    drive = "stress" if "stress" in spec else "displacement"
+    at, levels = np.array(spec[drive][0]), np.array(spec[drive][1])
+    if "steps" in spec:
+        grid = spec["origin"] + np.append(0.0, np.cumsum(spec["steps"]))
+        way = np.linspace(at[0], at[-1], grid.size)
+        return chain, ff.DisplacementDrive(np.interp(way, at, levels)), grid
+    values = np.interp(grid, spec["stop"] * (at - at[0]) / (at[-1] - at[0]), levels)
+    return chain, (ff.StressDrive if drive == "stress" else ff.DisplacementDrive)(values), grid
 
 
 # ------------------------------------------------------------------------------------- the design
