@@ -569,6 +569,47 @@ def _suspect(
 
 
 @inner
+def _locate(
+    y: Array, h: float, high_at: float, high_past: float, stress: Array, one: Tried, flags: Flags,
+    system: System, value: float, rate: float, tol: float, peak: float,
+) -> tuple[float, int]:  # fmt: skip
+    """Return the share of a step at which a switch is just passed, and the number of trials.
+
+    At the share `high_at` it is passed by `high_past`. False position and bisection alternate.
+    """
+    low_at, trials = 0.0, 0
+    low_past = min(overshoot(y, one.k[0], one.paces, flags, system, stress[0], peak), 0.0)
+    for turn in range(80):
+        if high_past <= 1e-16 or high_at - low_at <= 1e-15 * high_at:
+            break
+        mid = 0.5 * (low_at + high_at)
+        if turn % 3 != 2 and low_past < high_past < math.inf:
+            mid = high_at - high_past * (high_at - low_at) / (high_past - low_past)
+            mid += (1e-3 if turn % 3 == 0 else 0.0) * (high_at - mid)
+            if not low_at < mid < high_at:
+                mid = 0.5 * (low_at + high_at)
+        past = _past(y, mid * h, one, flags, system, value, rate, tol, peak)
+        trials += 1
+        if past > 0.0:
+            high_at, high_past = mid, past
+        else:
+            low_at, low_past = mid, past
+    return high_at, trials
+
+
+@inner
+def _reach(y: Array, lost: Array, moving: int, flags: Flags, springs: Array) -> None:
+    """Put each spring that is within rounding of an end of its branch exactly there."""
+    for i in range(flags.branch.size):
+        low, high, _, _ = _ends(springs[i], flags.branch[i], flags.ranks[i], flags.most[i])
+        floor = 1e-2 if flags.branch[i] < HELD else 1e-290
+        for bound in (low, high):
+            off = abs(y[moving + i] - bound)
+            if math.isfinite(bound) and off <= 1e-15 * max(abs(bound), floor):
+                y[moving + i], lost[moving + i] = bound, 0.0
+
+
+@inner
 def record_samples(
     y: Array, moving: int, flags: Flags, springs: Array, times: Array, now: float, done: int,
     pressure: float, nodes: Array, base: Array,
@@ -615,13 +656,10 @@ def _follow(
     now, done = (0.0 if struck else times[0]), 0
     if struck:
         y[groups - 1] = system.speed
-        while done < times.size and times[done] < 0.0:
-            nodes[:, done] = 0.0
-            nodes[count - 1, done] = times[done] * (
-                system.speed + 0.5 * system.gravity * times[done]
-            )
-            base[done] = 0.0
-            done += 1
+        done = np.searchsorted(times, 0.0)
+        nodes[count - 1, :done] = times[:done] * (
+            system.speed + 0.5 * system.gravity * times[:done]
+        )
     knot, steps, peak, largest = 0, 0, 0.0, 0.0
     pressed = False
     h = rate = 0.0
@@ -694,35 +732,20 @@ def _follow(
             return FLAT, steps, math.nan
         lifts = peak if pressed and stress[0] > 0.0 else 0.0
         past = overshoot(one.y1, one.rates, one.paces, flags, system, one.stress[0], lifts)
-        high_at = 1.0
+        at = 1.0
         if past <= 0.0:
             first = _suspect(y, stress, h, one, flags, system, value, rate, lifts > 0.0)
             if 1e-6 < first < 1.0:
-                past = _past(y, first * h, one, flags, system, value, rate, tol, lifts)
-                steps += 1
-                high_at, lands = first, False
+                at, steps = first, steps + 1
+                past = _past(y, at * h, one, flags, system, value, rate, tol, lifts)
         hit = past > 0.0
-        if hit:  # find its length by false position and bisection alternately
-            lands, low_at = False, 0.0
-            low_past = min(overshoot(y, one.k[0], one.paces, flags, system, stress[0], lifts), 0.0)
-            high_past = past
-            for turn in range(80):
-                if high_past <= 1e-16 or high_at - low_at <= 1e-15 * high_at:
-                    break
-                mid = 0.5 * (low_at + high_at)
-                if turn % 3 != 2 and low_past < high_past < math.inf:
-                    mid = high_at - high_past * (high_at - low_at) / (high_past - low_past)
-                    mid += (1e-3 if turn % 3 == 0 else 0.0) * (high_at - mid)
-                    if not low_at < mid < high_at:
-                        mid = 0.5 * (low_at + high_at)
-                past = _past(y, mid * h, one, flags, system, value, rate, tol, lifts)
-                steps += 1
-                if past > 0.0:
-                    high_at, high_past = mid, past
-                else:
-                    low_at, low_past = mid, past
-        length = high_at * h
-        if high_at < 1.0:  # the last trial may have another length
+        if hit:
+            at, trials = _locate(
+                y, h, at, past, stress, one, flags, system, value, rate, tol, lifts
+            )
+            steps += trials
+        length, lands = at * h, lands and at == 1.0 and not hit
+        if at < 1.0:  # the last trial may have another length
             _step(y, length, one, flags, system, value, rate, tol)
             steps += 1
         # accept the step, with compensated rounding
@@ -741,14 +764,7 @@ def _follow(
         h = following
         if hit:
             fill_rates(y, one.rates, one.stress, flags, system, value + rate * length, rate)
-            for i in range(count):
-                branch, ranks = flags.branch[i], (flags.ranks[i], flags.most[i])
-                low, high, _, _ = _ends(springs[i], branch, ranks[0], ranks[1])
-                for bound in (low, high):
-                    x = y[moving + i]
-                    floor = 1e-2 if flags.branch[i] < HELD else 1e-290
-                    if math.isfinite(bound) and abs(x - bound) <= 1e-15 * max(abs(bound), floor):
-                        y[moving + i], lost[moving + i] = bound, 0.0
+            _reach(y, lost, moving, flags, springs)
             if lifts > 0.0 and one.stress[0] <= 1e-15 * peak:
                 break
     # after contact the chain moves with the striker, without load
