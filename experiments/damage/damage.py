@@ -61,7 +61,7 @@ def kind(table: pd.DataFrame, name: str) -> pd.DataFrame:
 
 
 def twin_table(table: pd.DataFrame) -> str:
-    """Return mean and standard deviation by cycle, new and worn."""
+    """Return mean and standard deviation by cycle, new and worn; how often it is determined."""
     rows = []
     for name in ("new", "worn"):
         for cycle, group in kind(table, name).groupby("cycle"):
@@ -72,6 +72,8 @@ def twin_table(table: pd.DataFrame) -> str:
                 m, s = group[column].mean(), group[column].std()
                 unit = 1e3 if is_pressure(column) else 1.0
                 text = f"{significant(m / unit, 3)} ± {significant(s / unit, 2)}"
+                if column in NAMES:
+                    text += f" ({(group[f'{column}_state'] == 'determined').sum()})"
                 shown.append(f"{100 * m:.2f} ± {100 * s:.2f} %" if column in SHARES else text)
             rows.append(shown)
     head = ["", "cycle", "start strain", "dissipated (kJ/m³)", "misfit", *(n[3:] for n in NAMES)]
