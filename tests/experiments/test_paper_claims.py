@@ -11,8 +11,8 @@ import foamfit as ff
 from conftest import EXPERIMENTS
 
 sys.path.insert(0, str(EXPERIMENTS / "paper_claims"))
-import paper_claims as claims
-from paper_claims import FOAM_2, MODEL_1, MODEL_2, MODEL_3, OWN_MASS, STRIKER
+import claims
+from claims import FOAM_2, MODEL_1, MODEL_2, MODEL_3, OWN_MASS, STRIKER
 
 
 @pytest.fixture(scope="module")
