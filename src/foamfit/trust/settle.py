@@ -178,5 +178,6 @@ def back_to_plain(problem: Problem, tracker: Tracker) -> None:
         return
     unweighed = copy(objective)
     unweighed.weighing = None
-    if errs(BestPoint(replace(problem, objective=unweighed), tracker.best_values)):
+    alone = replace(problem, objective=unweighed)
+    if errs(BestPoint(alone, values)) or errs(BestPoint(alone, tracker.best_values)):
         objective.weighing, tracker.best_values, tracker.best_cost = None, values, cost
