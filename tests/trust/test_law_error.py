@@ -38,8 +38,8 @@ from foamfit.trust.residuals.noise_process import NoiseProcess
 sys.path.insert(0, str(EXPERIMENTS))
 sys.path.insert(0, str(EXPERIMENTS / "law_error"))
 import law_error
-import studies
 import real_foams
+import studies
 
 
 def noise(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:
