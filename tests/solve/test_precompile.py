@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import re
 import subprocess
@@ -13,12 +12,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 
 import fabricated
-from conftest import EXPERIMENTS, without_pictures
+from conftest import EXPERIMENTS, run, without_pictures
 from foamfit import api
-from foamfit.cli import main
 from foamfit.solve import cache, precompile
 from foamfit.solve.compiled import loop
 from foamfit.springs.compiled import bistable
@@ -105,7 +102,7 @@ def test_the_first_use_says_that_it_compiles(
     for ready in (False, True):
         monkeypatch.setattr(cache, "compiled", lambda *_, ready=ready: ready)
         out = str(tmp_path / f"{ready}")
-        told = CliRunner().invoke(main, ["fit", str(RECONSTRUCTION), "--out", out])
+        told = run("fit", RECONSTRUCTION, "--out", out)
         assert told.exit_code == 0, told.output
         assert ("compiling the solver" in told.stderr) == (not ready)
     assert asked == [("integrate", "bistable"), ("follow", "bistable")]
@@ -123,28 +120,6 @@ def test_what_was_compiled_of_another_source_is_no_use(
     os.utime(made[1], (0.0, 0.0))
     assert not cache.compiled()
     assert [path.exists() for path in made] == [True, False]
-
-
-def test_what_is_compiled_where_it_is_needed_is_announced_once(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    class Loop:
-        __name__ = "integrate_slowly"
-        signatures: tuple[object, ...] = ()
-
-    keep_in(tmp_path, monkeypatch)
-    caplog.set_level(logging.WARNING, logger="foamfit")  # an earlier --quiet may have raised it
-    new, known, kept, other = Loop(), Loop(), Loop(), Loop()
-    known.signatures = ((),)
-    cache._first.cache_clear()
-    for one in (new, new, known, other):
-        cache.announce(one, "the solver of slow scenes")
-    (tmp_path / "implicit.integrate_slowly-30.py311.1.nbc").touch()
-    cache.announce(kept, "the solver of slow scenes")
-    assert [record.getMessage() for record in caplog.records] == [
-        "foamfit: compiling the solver of slow scenes, once after installation",
-        "foamfit: compiling the solver of slow scenes",
-    ]
 
 
 def test_every_module_with_compiled_loops_is_known() -> None:

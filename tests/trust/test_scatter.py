@@ -22,19 +22,6 @@ def test_equal_errors_leave_what_the_text_books_have():
     assert found.tau_stderr == pytest.approx(variance * np.sqrt(2 / 4) / (2 * found.tau), rel=1e-4)
 
 
-def test_estimates_that_their_errors_explain_have_no_spread():
-    found = common_and_spread(np.array([1.0, 1.1, 0.9, 1.02]), np.eye(4))
-    assert (found.tau, found.tau_stderr) == (0.0, None)
-    assert found.tau_ci95[0] == 0.0
-    assert found.mean == pytest.approx(1.005)
-
-
-def test_an_uncertain_estimate_hardly_counts():
-    errors = np.diag([0.1, 0.1, 0.1, 50.0]) ** 2
-    found = common_and_spread(np.array([1.0, 1.2, 0.8, 30.0]), errors)
-    assert found.mean == pytest.approx(1.0, abs=0.02)
-
-
 def test_an_error_that_all_have_in_common_is_no_spread_but_one_of_the_mean():
     values, own = np.array([1.0, 1.3, 0.7, 1.1, 0.9]), 0.1**2 * np.eye(5)
     alone, common = common_and_spread(values, own), common_and_spread(values, own + 0.5**2)
