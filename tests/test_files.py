@@ -63,16 +63,6 @@ def left_behind(path: Path, ending: str, process: int) -> Path:
 # ---------------------------------------------------------------- ownership of the folder
 
 
-def test_a_result_with_a_file_of_others_is_refused_and_kept(here: Path) -> None:
-    folder = fabricated.result(seed=1).save("r")
-    (here / "r" / "notes.txt").write_text("a month of work")
-    with pytest.raises(InputError, match=r"r holds notes\.txt, which foamfit did not write"):
-        fabricated.result(seed=2).save("r")
-    assert load_result(folder)["seed"] == 1
-    assert (here / "r" / "notes.txt").read_text() == "a month of work"
-    assert names(here) == ["r"]
-
-
 def test_a_folder_a_link_or_a_json_of_others_is_not_what_a_fit_writes(here: Path) -> None:
     ladder = fabricated.result().save("r") / "ladder.csv"
     ladder.mkdir()

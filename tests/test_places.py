@@ -99,15 +99,6 @@ def test_the_name_has_the_model_and_every_option_that_changes_the_numbers(
     assert fitted(*options.split()) == [f"fits/foam/{name}"]
 
 
-def test_a_long_name_is_cut_and_stays_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: fabricated.result())
-    given = [f"--fix=s1_{name}={1 / 7}" for name in ("k0", "kc", "eps_a", "kh_plus", "kh_minus")]
-    fit(*given, "--fix=s1_eps_c=0.31")
-    names = [Path(place).name for place in fitted(*given, "--fix=s1_eps_c=0.32")]
-    assert len(set(names)) == 2
-    assert all(len(name) <= 120 for name in names)
-
-
 def test_other_options_and_cycles_get_folders_of_their_own() -> None:
     assert fitted(*FAST) == ["fits/foam/linear"]
     first = files()

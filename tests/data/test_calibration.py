@@ -118,16 +118,6 @@ def test_the_printed_line_keeps_column_and_unit_of_the_force(entry: str, tmp_pat
     assert quantities(path) == []
 
 
-@pytest.mark.parametrize(
-    ("spread", "found"), [("", True), (" ± 5 %", False), (" ± 1 %", True), (" ± 0.2 %", True)]
-)
-def test_a_stated_deviation_is_the_measure(spread: str, found: bool, tmp_path: Path) -> None:
-    record = rig.impact(rig.Impact(), 5)
-    stated = f"{0.94 * record.rig.velocity:.8g} m/s{spread}"
-    path = rig.write(replace(record, toml_velocity=stated), tmp_path)
-    assert quantities(path) == ["velocity"] * found
-
-
 @pytest.mark.parametrize("share", [0.05, -0.03])
 def test_a_linear_drift_of_the_force_is_taken_off(share: float, tmp_path: Path) -> None:
     for seed in (1, 2):

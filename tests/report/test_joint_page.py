@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
 from foamfit.fitting.together import Together
 from foamfit.report.figures import image
-from foamfit.report.studies.joint import joint_page, joint_text, plot_compared, plot_joint
+from foamfit.report.studies.joint import joint_page, plot_compared, plot_joint
 from foamfit.study.joint_fit import Alternative, fit_jointly
 from foamfit.study.joint_result import JointResult, result_of
 from foamfit.study.study_file import Study
@@ -95,14 +94,6 @@ def test_the_page_has_every_parameter_and_test(found, page):
     assert re.search(rf'data-v="{value / 1e3:.0f}(\.\d)?">', body)
     assert re.search(r"b = 0\.0\d+ \(0\.0\d+ to 0\.0\d+\)", page)
     assert page.count("<td>log rate</td>") == 2  # in the parameter and evidence tables
-
-
-def test_ranges_are_told_where_there_are_some(found, page):
-    assert "<th>range</th>" not in page
-    k0 = replace(found.parameters["s1_k0"], range=(5.2e5, 5.8e5))
-    ranged = replace(found, parameters={**found.parameters, "s1_k0": k0})
-    assert ">520 to 580 kPa<" in joint_page(ranged, Path(), b"<svg/>", b"<svg/>")
-    assert "520.0 to 580.0 kPa" in joint_text(ranged)
 
 
 def test_the_picture_has_a_loop_for_each_test_and_a_panel_for_each_law_of_rate(found):

@@ -107,13 +107,6 @@ def test_the_page_says_what_was_found() -> None:
         assert said in words
 
 
-def test_branches_are_told_per_spring() -> None:
-    words = page(visited={"s1": ("a", "d")}).words
-    assert "d · snap-buckling c · densified, not reached e · snap-back, not reached" in words
-    whole = Page(render_report(fabricated.chain_result(), fabricated.no_figures())).words
-    assert "s1 linear, has no branches s2 a · elastic" in whole
-
-
 @pytest.mark.parametrize(
     ("value", "stderr", "unit", "expected"),
     [

@@ -93,7 +93,8 @@ def test_against_reference(name: str, drive: str, rtol: float, bar: float) -> No
     got = run(CHAINS[name], load, rtol)
     assert max(errors(got, want)) <= bar
     assert got.method == RADAU
-    assert len(got.switches) >= want.switches
+    usual = ff.simulate(built(CHAINS[name]), load, TIME, rtol=rtol)
+    assert len(got.switches) >= len(usual.switches)
     if want.contact_end is not None:
         assert got.contact_end == pytest.approx(want.contact_end, rel=bar)
     assert got.steps < 3000
@@ -110,18 +111,6 @@ def test_dashpots_like_explicit_steps(name: str, eta: float, rtol: float, bar: f
     # with heavy dashpots the striker separates so slowly that explicit steps are no more accurate
     assert got.contact_end == pytest.approx(want.contact_end, rel=bar if eta < 1e6 else 1e-4)
     assert got.steps < 1000
-
-
-def test_flat_branches_like_explicit_steps() -> None:
-    flat = Bistable(2e6, 60e6, -0.3e6, 0.35, 0.66, 0.0, 0.0)
-    for chain in (
-        Chain((flat,), (1e-3,), AREA),
-        Chain((BASE_3, flat), THREE, AREA),
-        Chain((damped(BASE_3, 100.0), flat), THREE, AREA),
-        Chain((damped(BASE_3, 100.0), damped(flat, 10.0)), THREE, AREA),
-    ):
-        want = run(chain, ff.Impact(7e-3, 1.75), 1e-11, implicit=False)
-        assert max(errors(run(chain, ff.Impact(7e-3, 1.75), 1e-8), want)) <= 1e-8
 
 
 def test_flat_branch_under_stress_is_refused() -> None:

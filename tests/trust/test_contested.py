@@ -76,14 +76,6 @@ def test_a_contradicted_impact_is_driven_by_its_motion(
     assert ff.load(tmp_path / "out").contradictions == impact.contradictions
 
 
-def test_a_right_impact_stays_one(tmp_path: Path) -> None:
-    test = ff.read_test(rig.write(record_of(2), tmp_path))
-    result = ff.fit(test, model="microscale", **QUICK)
-    assert (result.drive, result.contradictions) == ("impact", ())
-    assert "contradictions" not in result.to_json_dict()
-    assert result.parameters["s1_k0"].state == "determined"
-
-
 @pytest.mark.parametrize(
     ("wrong", "name"),
     [
