@@ -113,14 +113,6 @@ def test_a_mass_inside_is_read(tmp_path, header, scale):
     assert f"displacement_1 from {header!r}" in test.notes[0]
 
 
-def test_the_top_by_another_name_is_not_inside(tmp_path):
-    test = read_test(write(tmp_path, INSIDE + "displacement_2 (mm)", inside(4.0)))
-    assert test.interior == {}
-    assert any(
-        note.startswith("displacement_2 is the displacement of the top") for note in test.notes
-    )
-
-
 # Files that are rejected, with one sentence that names the error.
 
 

@@ -83,12 +83,6 @@ def test_a_wrong_scale_of_force_is_found(scale, words):
     assert all(word in sentences for word in words)
 
 
-def test_a_loop_run_the_wrong_way_is_found():
-    test = bounce()
-    stress = np.where(test.time > test.time[399], 3 * test.stress, test.stress)
-    assert any("gives out more" in w for w in audit(replace(test, stress=stress)).warnings())
-
-
 @pytest.mark.parametrize(
     ("change", "gone", "words"),
     [

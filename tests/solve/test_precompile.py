@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
 import subprocess
@@ -120,6 +121,28 @@ def test_what_was_compiled_of_another_source_is_no_use(
     os.utime(made[1], (0.0, 0.0))
     assert not cache.compiled()
     assert [path.exists() for path in made] == [True, False]
+
+
+def test_what_is_compiled_where_it_is_needed_is_announced_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Loop:
+        __name__ = "integrate_slowly"
+        signatures: tuple[object, ...] = ()
+
+    keep_in(tmp_path, monkeypatch)
+    caplog.set_level(logging.WARNING, logger="foamfit")  # an earlier --quiet may have raised it
+    new, known, kept, other = Loop(), Loop(), Loop(), Loop()
+    known.signatures = ((),)
+    cache._first.cache_clear()
+    for one in (new, new, known, other):
+        cache.announce(one, "the solver of slow scenes")
+    (tmp_path / "implicit.integrate_slowly-30.py311.1.nbc").touch()
+    cache.announce(kept, "the solver of slow scenes")
+    assert [record.getMessage() for record in caplog.records] == [
+        "foamfit: compiling the solver of slow scenes, once after installation",
+        "foamfit: compiling the solver of slow scenes",
+    ]
 
 
 def test_every_module_with_compiled_loops_is_known() -> None:

@@ -119,14 +119,6 @@ def test_a_combination_is_named_with_its_powers(
     assert told == said or ("compensated" in said and said in told)
 
 
-def test_a_zero_has_no_powers() -> None:
-    """The origin of the coordinate is arbitrary, so powers of it have no meaning."""
-    plain = insight_of(100 * np.column_stack([X, -X, 1 - X]))
-    insight = replace(plain, names=("contact_time", "displacement_zero", "s1_k0"))
-    told = insight.combination("contact_time", 1.0)
-    assert told == "compensated by displacement_zero (+1) (relative changes)"
-
-
 def test_the_weakest_direction_is_told_in_words() -> None:
     alike = insight_of(np.column_stack([X, X * (1 + 1e-3 * X), 50 * (1 - X)]))
     error, parts = alike.weakest()
