@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -18,9 +19,12 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 import pytest
+from click.testing import CliRunner, Result
+from scipy.signal import lfilter
 
 import fabricated
 import foamfit as ff
+from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.report import folder as result_folder
 from foamfit.solve import cache, precompile
@@ -29,6 +33,9 @@ ROOT = Path(__file__).parent.parent
 EXPERIMENTS = ROOT / "experiments"
 DATA = Path(os.environ.get("FOAMFIT_DATA", ROOT.parent / "shared" / "data"))
 
+# Records made by the studies, which share no code with foamfit.
+STUDIES = ("recovery", "law_error", "real_foams", "stability", "microscale", "paper_claims", "")
+sys.path += [str(EXPERIMENTS / name) for name in STUDIES]
 gc.disable()  # imported modules and collected tests live until exit
 HEIGHT, AREA = 1.19e-3, 1.9635e-5
 os.environ["COLUMNS"] = "100"  # the same output width in every terminal
@@ -103,9 +110,50 @@ def compiled() -> Iterator[None]:
     yield
 
 
+def run(*args: object) -> Result:
+    """Call a command of foamfit."""
+    return CliRunner().invoke(main, [str(arg) for arg in args])
+
+
+def run_refused(*args: object) -> str:
+    """Call a command that must be refused; return its only sentence."""
+    told = run(*args)
+    assert (told.exit_code, told.stdout) == (1, ""), told.output
+    assert re.fullmatch(r"foamfit: [^\n]+\n", told.stderr)
+    assert "defect" not in told.stderr
+    return told.stderr
+
+
 def write_csv(path: Path, head: str, *columns: Any, fmt: str = "%.9g") -> Path:
     """Write columns under a head."""
     np.savetxt(path, np.column_stack(columns), fmt, ",", header=head, comments="")
+    return path
+
+
+def write_measurement(path: Path, test: Measurement, more: str = "") -> Path:
+    """Write a test as CSV and TOML, with more lines of TOML at the end."""
+    columns = {"time (s)": test.time, "stress (Pa)": test.stress}
+    columns = {name: values for name, values in columns.items() if values is not None}
+    head = ",".join([*columns, "displacement (m)"])
+    write_csv(path, head, *columns.values(), test.displacement)
+    one, by = test.specimen, test.striker
+    toml = f'[specimen]\nheight = "{one.height} m"\narea = "{one.area} m^2"\n'
+    toml += f'[striker]\nmass = "{by.mass} kg"\nvelocity = "{by.velocity} m/s"\n' if by else ""
+    path.with_suffix(".toml").write_text(toml + more)
+    return path
+
+
+def correlated(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:
+    """Return autoregressive noise of unit variance; `rho` is the correlation of neighbours."""
+    white = rng.standard_normal(n + 500)
+    return lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], white)[500:]
+
+
+def specimen_toml(folder: Path, height: float, diameter: float, more: str = "") -> Path:
+    """Write the TOML of a cylinder with these sizes in mm."""
+    path = folder / "specimen.toml"
+    sizes = f'height = "{height} mm"\ndiameter = "{diameter} mm"\n'
+    path.write_text(f"[specimen]\n{sizes}{more}", encoding="utf-8")
     return path
 
 

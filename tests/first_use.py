@@ -32,14 +32,6 @@ def along() -> None:
         ff.simulate(chain, drive, TIME, sensitivities=["s1_kc"])
 
 
-def struck() -> None:
-    """Compile the impact on a relaxing microscale spring."""
-    response = ff.simulate(
-        microscale((0.5, 0.2)), ff.Impact(7e-3, 2.0), 1e-3 * TIME, sensitivities=["s1_kc"]
-    )
-    assert response.method == "Dormand-Prince"
-
-
 def judge() -> None:
     """Compile the brute-force reference of the stability study."""
     sys.path.append(str(Path(__file__).parents[1] / "experiments" / "stability"))
@@ -50,4 +42,4 @@ def judge() -> None:
 
 if __name__ == "__main__":
     gc.disable()  # compiled objects live until exit
-    {"along": along, "struck": struck, "judge": judge}[sys.argv[1]]()
+    {"along": along, "judge": judge}[sys.argv[1]]()

@@ -12,14 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import fabricated
 import foamfit as ff
-from conftest import DATA, needs_data, thinned
+from conftest import DATA, needs_data, run, run_refused, specimen_toml, thinned
 from foamfit.cards import curves as card_curves
 from foamfit.cards.card import FORMATS, UNITS
-from foamfit.cli import main
 from foamfit.data.measurement import Specimen
 from foamfit.results import Curves
 
@@ -184,10 +182,9 @@ def test_what_the_card_loses_is_said(fit: Path, joint: Path) -> None:
 
 @needs_data
 def test_on_real_foam_three_parameters_lose_little_and_two_more(tmp_path: Path) -> None:
-    toml = tmp_path / "foam.toml"
-    toml.write_text('[specimen]\nheight = "10.53 mm"\ndiameter = "7.63 mm"\n')
     file = thinned(DATA / "shoe-foam" / "turbo-comp-1_cycle1.csv", tmp_path, 4)
-    test, law = ff.read_test(file, toml), {"model": "microscale", "relaxation": 1}
+    test = ff.read_test(file, specimen_toml(tmp_path, 10.53, 7.63))
+    law = {"model": "microscale", "relaxation": 1}
     fit = ff.fit(test, **law, starts=3, intervals="local")
     three, two = (ff.card(fit, format=style) for style in ("mat083", "mat057"))
     assert fit.misfit["stress_strain"] < 0.007
@@ -294,30 +291,6 @@ def test_the_other_solvers_read_their_cards(joint: Path) -> None:
     np.testing.assert_allclose(parts[1][:, 0], card.curves.stress[0], rtol=1e-6)
 
 
-def test_a_reader_of_others_reads_the_ls_dyna_cards(joint: Path) -> None:
-    core = pytest.importorskip(
-        "ansys.dyna.core", reason="the reader is missing: pip install 'foamfit[cards]'"
-    )
-    for style in ("mat083", "mat057"):
-        card = ff.card(joint, format=style)
-        deck = core.Deck()
-        deck.loads(card.text)
-        assert not deck.string_keywords
-        material, *more = deck.keywords
-        assert material.ro * 1e9 == pytest.approx(MASS / (AREA * HEIGHT), rel=1e-3)
-        assert (material.hu, material.shape) == pytest.approx(card.unloading[:2], rel=1e-5)
-        curves = [one for one in more if one.subkeyword == "CURVE"]
-        assert len(curves) == len(card.curves.rates)
-        for one, stress in zip(curves, card.curves.stress, strict=True):
-            np.testing.assert_allclose(one.curves["o1"] * 1e9, stress, rtol=1e-6)
-        if style == "mat083":
-            assert material.expon == pytest.approx(card.unloading.EXPON, rel=1e-5)
-            assert more[0].tbid == material.tbid
-            np.testing.assert_allclose(np.array(more[0].points.data) * 1e3, card.curves.rates)
-        else:
-            assert curves[0].lcid == material.lcid
-
-
 def test_an_unknown_density_is_no_number(tmp_path: Path, fit: Path) -> None:
     known = ff.load(fit)
     test = replace(known.measurement, specimen=Specimen(HEIGHT, AREA))
@@ -332,15 +305,11 @@ def test_an_unknown_density_is_no_number(tmp_path: Path, fit: Path) -> None:
 # ------------------------------------------------------------------------------- files, refusals
 
 
-def run(*args: object) -> Any:
-    return CliRunner().invoke(main, ["card", *map(str, args)])
-
-
 def test_the_command_writes_card_numbers_and_picture(
     fit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    done = run(fit, "--format", "mat083", "--rates", "0.25,10")
+    done = run("card", fit, "--format", "mat083", "--rates", "0.25,10")
     assert done.exit_code == 0, done.output
     assert "cards/a-foam-mat083.k" in done.output
     names = ["a-foam-mat083.k", *(f"a-foam-mat083.k.{one}" for one in ("json", "pdf", "png"))]
@@ -372,10 +341,7 @@ def test_a_wrong_call_is_one_sentence_and_writes_nothing(
     fit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: list[str], words: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    done = run(fit, *given)
-    assert done.exit_code == 1
-    assert words in done.output
-    assert done.output.count("\n") == 1
+    assert words in run_refused("card", fit, *given)
     assert not list(tmp_path.iterdir())
 
 
@@ -391,25 +357,19 @@ def test_a_result_without_a_card_is_refused(tmp_path: Path, fit: Path) -> None:
         (tmp_path / "older", "fit the test again"),
         (tmp_path / "nothing", "is not a result folder"),
     ):
-        done = run(result, "--format", "mat083", "--out", tmp_path / "card.k")
-        assert (done.exit_code, done.output.count("\n")) == (1, 1)
-        assert words in done.output
-    done = run(fit, "--format", "csv", "--out", fit / "card.csv")
-    assert done.exit_code == 1
-    assert "lies in a result" in done.output
+        told = run_refused("card", result, "--format", "mat083", "--out", tmp_path / "card.k")
+        assert words in told
+    told = run_refused("card", fit, "--format", "csv", "--out", fit / "card.csv")
+    assert "lies in a result" in told
     assert not list(tmp_path.glob("card*"))
     with pytest.raises(ff.InputError, match="rates"):
         ff.card(fit, format="csv", rates=0.0)
 
 
-def test_a_result_in_memory_gives_the_card_of_its_folder(tmp_path: Path) -> None:
+def test_a_result_in_memory_gives_the_card_of_its_folder(tmp_path: Path, joint: Path) -> None:
     made = fabricated.microscale_result()
     made.save(tmp_path / "fit", report=False)
-    first, second = (ff.card(one, format="mat083") for one in (made, tmp_path / "fit"))
-    assert first.text == second.text
-    assert first.to_json_dict() == second.to_json_dict()
-
-
-def test_a_joint_result_read_back_gives_the_card_of_its_folder(joint: Path) -> None:
-    first, second = (ff.card(one, format="mat083") for one in (ff.load(joint), joint))
-    assert first.text == second.text
+    for one, folder in ((made, tmp_path / "fit"), (ff.load(joint), joint)):
+        first, second = (ff.card(given, format="mat083") for given in (one, folder))
+        assert first.text == second.text
+        assert first.to_json_dict() == second.to_json_dict()

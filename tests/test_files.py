@@ -9,25 +9,21 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
 import fabricated
 import foamfit.api
 import foamfit.report.figures
 import foamfit.report.folder
 import foamfit.results
-from conftest import EXPERIMENTS, without_pictures
-from foamfit.cli import main
+from conftest import EXPERIMENTS, run, run_refused, without_pictures
 from foamfit.errors import InputError
 from foamfit.files import check_file, csv_bytes, replacing, write_file
 from foamfit.report.folder import check_target, load_result
 from foamfit.report.plots import plot_fit
-from foamfit.report.result_figures import Images
 from foamfit.report.studies.batch import row_of, write_summary
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
@@ -67,16 +63,6 @@ def left_behind(path: Path, ending: str, process: int) -> Path:
 # ---------------------------------------------------------------- ownership of the folder
 
 
-def test_a_result_with_a_file_of_others_is_refused_and_kept(here: Path) -> None:
-    folder = fabricated.result(seed=1).save("r")
-    (here / "r" / "notes.txt").write_text("a month of work")
-    with pytest.raises(InputError, match=r"r holds notes\.txt, which foamfit did not write"):
-        fabricated.result(seed=2).save("r")
-    assert load_result(folder)["seed"] == 1
-    assert (here / "r" / "notes.txt").read_text() == "a month of work"
-    assert names(here) == ["r"]
-
-
 def test_a_folder_a_link_or_a_json_of_others_is_not_what_a_fit_writes(here: Path) -> None:
     ladder = fabricated.result().save("r") / "ladder.csv"
     ladder.mkdir()
@@ -93,54 +79,13 @@ def test_a_folder_a_link_or_a_json_of_others_is_not_what_a_fit_writes(here: Path
             check_target("s")
 
 
-def test_what_is_put_into_the_folder_while_it_is_written_stays(
-    here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = fabricated.result(seed=1).save("r")
-
-    def late(*_: object) -> Iterable[tuple[str, Images | None]]:
-        (here / "r" / "notes.txt").write_text("x")
-        return fabricated.no_figures().items()
-
-    monkeypatch.setattr(foamfit.report.folder, "draw_all", late)
-    with pytest.raises(InputError, match=r"notes\.txt"):
-        fabricated.result(seed=2).save("r")
-    assert load_result(folder)["seed"] == 1
-    assert names(here) == ["r"]
-
-
 @pytest.mark.parametrize("out", [".", "..", "{here}", "../link"])
 def test_the_current_directory_is_refused(here: Path, out: str) -> None:
     (here / "cwd").mkdir()
     (here / "link").symlink_to(here / "cwd")
     os.chdir(here / "cwd")
     path = out.format(here=here / "cwd")
-    result = CliRunner().invoke(main, ["fit", str(RECONSTRUCTION), "--out", path])
-    assert (result.exit_code, result.stdout) == (1, "")
-    assert "current directory" in result.stderr
-    assert result.stderr.count("\n") == 1
-
-
-def test_a_link_to_a_result_stays_a_link(here: Path) -> None:
-    fabricated.result(seed=1).save("r")
-    (here / "link").symlink_to("r")
-    fabricated.result(seed=2).save("link")
-    assert (here / "link").is_symlink()
-    assert load_result("r")["seed"] == 2
-    (here / "to nothing").symlink_to("new")
-    fabricated.result().save("to nothing")
-    assert load_result("new")["schema"] == 1
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [("loop", "link|levels|is a file"), ("x" * 300, "too long"), ("file/r", "a file")],
-)
-def test_what_cannot_be_a_folder_is_said_before_the_fit(here: Path, name: str, words: str) -> None:
-    (here / "loop").symlink_to("loop")
-    (here / "file").write_text("x")
-    with pytest.raises(InputError, match=f"(?i){words}"):
-        check_target(name)
+    assert "current directory" in run_refused("fit", RECONSTRUCTION, "--out", path)
 
 
 # ---------------------------------------------------------------- no incomplete files
@@ -191,7 +136,7 @@ def test_what_cannot_be_written_in_the_end_is_saved_beside(
 
     save = foamfit.api.FitResult.save
     monkeypatch.setattr(foamfit.api.FitResult, "save", denied)
-    result = CliRunner().invoke(main, [*CALL, "--no-report"])
+    result = run(*CALL, "--no-report")
     (saved,) = names(here)
     assert result.exit_code == 1
     assert result.stderr.endswith(f"to r: No space; it is in {saved} instead\n")
@@ -203,19 +148,19 @@ def test_a_report_that_fails_loses_no_numbers(here: Path, monkeypatch: pytest.Mo
         raise ZeroDivisionError("of a figure")
 
     monkeypatch.setattr(foamfit.report.folder, "render_report", fail)
-    result = CliRunner().invoke(main, CALL)
+    result = run(*CALL)
     assert (result.exit_code, "of a figure" in result.stderr) == (70, True)
     assert load_result("r")["model"] == "bistable"
     assert names(here / "r") == TABLES
 
 
 def test_without_a_report_there_are_tables_alone(here: Path) -> None:
-    result = CliRunner().invoke(main, [*CALL, "--no-report"])
+    result = run(*CALL, "--no-report")
     assert result.exit_code in (0, 2)
     assert result.stdout.endswith("\nwritten to r\n")
     assert names(here / "r") == TABLES
     assert names(fabricated.result().save("s", report=False)) == TABLES
-    result = CliRunner().invoke(main, [*CALL, "--no-report", "--open"])
+    result = run(*CALL, "--no-report", "--open")
     assert "--open and --no-report exclude each other" in result.stderr
 
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from conftest import without_pictures, write_csv
-from foamfit.cli import main
+from conftest import run, run_refused, without_pictures, write_csv
 from foamfit.errors import InputError
 from foamfit.springs import laws
 
@@ -65,26 +62,13 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run(*words: object) -> Result:
-    return CliRunner().invoke(main, [str(word) for word in words])
-
-
-def refused(*words: object) -> str:
-    """Return the single error message with which a command fails."""
-    told = run(*words)
-    assert (told.exit_code, told.stdout) == (1, ""), told.output
-    assert re.fullmatch(r"foamfit: [^\n]+\n", told.stderr)
-    assert "defect" not in told.stderr
-    return told.stderr
-
-
 def test_a_law_of_a_file_simulates(here: Path, cubic: Path) -> None:
     (here / "drive.csv").write_text("time (s),displacement (mm)\n0,0\n1,2\n2,4\n3,0\n")
     (here / "scene.toml").write_text(
         '[chain]\narea = "1 cm^2"\n[[chain.springs]]\nkind = "cubic"\nheight = "10 mm"\n'
         'k = "0.2 MPa"\nq = "1 MPa"\n[drive]\nkind = "displacement"\nfile = "drive.csv"\n'
     )
-    assert "kind = 'cubic'" in refused("simulate", "scene.toml")
+    assert "kind = 'cubic'" in run_refused("simulate", "scene.toml")
     assert run("simulate", "scene.toml", "--law", cubic).exit_code == 0
     stress, strain = np.loadtxt(here / "scene.csv", delimiter=",", skiprows=1).T[1:3]
     np.testing.assert_allclose(strain, [0.0, 0.2, 0.4, 0.0], atol=1e-12)
@@ -102,7 +86,7 @@ def test_a_law_of_a_file_is_fitted_and_predicts(
         assert found[name]["state"] == "determined"
         assert found[name]["value"] == pytest.approx(true, rel=0.02)
     monkeypatch.setattr(laws, "_LAWS", {k: v for k, v in laws._LAWS.items() if k != "cubic"})
-    assert "'cubic' is not a spring" in refused("predict", "r", "t2.csv")
+    assert "'cubic' is not a spring" in run_refused("predict", "r", "t2.csv")
     told = run("predict", "r", "t2.csv", "--law", cubic, "--json", "--no-report")
     assert told.exit_code == 0, told.output
     assert json.loads(told.stdout)["misfit"]["stress_strain"] < 0.01
@@ -122,35 +106,17 @@ def test_processes_of_a_batch_know_the_law_as_it_is_now(here: Path) -> None:
     assert second["s1_q"] != pytest.approx(first["s1_q"], rel=0.1)
 
 
-def test_the_process_of_the_page_knows_the_law(here: Path, cubic: Path) -> None:
-    import time
-
-    from foamfit.page.desk import Desk
-
-    laws.load_file(cubic)
-    desk = Desk(here / "window")
-    desk.take(here / "t1.csv")
-    assert desk.check(*desk.dropped_toml())  # raises an error if the test is invalid
-    worker = desk.fit(["--model", "cubic", "--starts", "1", "--no-report"])
-    end = time.monotonic() + 60.0
-    while worker.ended is None:
-        assert time.monotonic() < end
-        time.sleep(0.05)
-    assert worker.ended == ""
-    desk.close()
-
-
 def test_no_toml_no_result_and_no_browser_names_a_law_file(here: Path) -> None:
     """A law file is code, so only the command line may name one."""
     from foamfit.page.worker import parsed
 
     (here / "law.py").write_text("import pathlib\npathlib.Path('run').touch()\n")
     (here / "scene.toml").write_text('law = "law.py"\n[chain]\npublished = "foam-2"\n')
-    assert "'law'" in refused("simulate", "scene.toml")
+    assert "'law'" in run_refused("simulate", "scene.toml")
     (here / "study.toml").write_text('law = "law.py"\ntests = ["t1.csv"]\nmodel = "linear"\n')
-    assert "'law'" in refused("joint", "study.toml")
+    assert "'law'" in run_refused("joint", "study.toml")
     (here / "t1.toml").write_text('law = "law.py"\n[specimen]\nheight = "1 cm"\narea = "1 cm^2"\n')
-    assert "'law'" in refused("check", "t1.csv")
+    assert "'law'" in run_refused("check", "t1.csv")
     for given in (["--law", "law.py"], ["--law=law.py"]):
         with pytest.raises(InputError, match="--law"):
             parsed(given)

@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
 import fabricated
-import foamfit as ff
-from conftest import EXPERIMENTS, without_pictures
+from conftest import EXPERIMENTS, run, run_refused, without_pictures
 from foamfit import api
-from foamfit.cli import main
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 
@@ -31,7 +29,7 @@ def opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def fit(monkeypatch: pytest.MonkeyPatch, *args: str, **changed: Any) -> Result:
     made = fabricated.result(**changed)
     monkeypatch.setattr(api, "fit", lambda *_, **__: made)
-    return CliRunner().invoke(main, ["fit", str(RECONSTRUCTION), "--out", "r", *args])
+    return run("fit", str(RECONSTRUCTION), "--out", "r", *args)
 
 
 @pytest.mark.parametrize(("status", "code"), [("ok", 0), ("warnings", 0), ("failed", 2)])
@@ -40,14 +38,6 @@ def test_the_report_is_opened_whatever_was_found(
 ) -> None:
     assert fit(monkeypatch, "--open", status=status).exit_code == code
     assert opened == [(Path.cwd() / "r" / "report.html").as_uri()]
-
-
-def test_nothing_is_opened_unasked_or_where_nothing_is_found(
-    opened: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert fit(monkeypatch).exit_code == 0
-    assert CliRunner().invoke(main, ["fit", "none.csv", "--open"]).exit_code == 1
-    assert opened == []
 
 
 @pytest.mark.parametrize("failure", [False, webbrowser.Error("could not locate runnable browser")])
@@ -74,19 +64,5 @@ def test_without_a_browser_a_sentence_says_so_and_the_exit_code_stays(
 def test_json_for_a_program_and_a_browser_exclude_each_other(
     opened: list[str], command: list[str]
 ) -> None:
-    told = CliRunner().invoke(main, [*command, "--open", "--json"])
-    assert told.exit_code == 1
-    assert told.stderr == ("foamfit: --open and --json exclude each other; leave one of them out\n")
-
-
-def test_cycles_open_their_picture(opened: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    failed = {1: fabricated.result(status="failed")}
-    found = ff.CycleFits("foam", "bistable", (1,), failed, {})
-    monkeypatch.setattr(ff.CycleFits, "save", lambda *_, **__: None)
-    monkeypatch.setattr("foamfit.study.cycles.fit_cycles", lambda *_, **__: found)
-    monkeypatch.setattr("foamfit.report.studies.cycles.cycles_text", lambda _: "told")
-    told = CliRunner().invoke(
-        main, ["fit", str(RECONSTRUCTION), "--cycle", "all", "--out", "r", "--open"]
-    )
-    assert told.exit_code == 2
-    assert opened == [(Path.cwd() / "r" / "cycles.png").as_uri()]
+    told = run_refused(*command, "--open", "--json")
+    assert told == "foamfit: --open and --json exclude each other; leave one of them out\n"

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
 import fabricated
 import foamfit as ff
-from conftest import synthetic_impact, without_pictures
-from foamfit.cli import main
+from conftest import run, run_refused, without_pictures
 
 TOML = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\nmass = "1 g"\n'
 FAST = ("--model", "linear", "--quiet", "--no-report")
@@ -40,13 +37,13 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return write(tmp_path / "foam.csv")
 
 
-def run(*args: object) -> Result:
-    return CliRunner().invoke(main, ["fit", "foam.csv", *map(str, args)])
+def fit(*args: object) -> Result:
+    return run("fit", "foam.csv", *args)
 
 
 def fitted(*args: object) -> list[str]:
     """Run a fit, and return all result folders of the test afterwards."""
-    told = run(*args)
+    told = fit(*args)
     assert told.exit_code == 0, told.output
     return sorted(str(path.parent) for path in Path().rglob("*.json") if path.parent.parent.name)
 
@@ -57,11 +54,9 @@ def refused(*args: object) -> str:
     with pytest.MonkeyPatch.context() as patch:
         for made in ("foamfit.study.cycles.fit", "foamfit.api.fit"):
             patch.setattr(made, lambda *_, **__: pytest.fail("the fit was made"))
-        told = run(*args)
-    assert (told.exit_code, told.stdout) == (1, ""), told.output
-    assert re.fullmatch(r"foamfit: [^\n]+\n", told.stderr)
+        told = run_refused("fit", "foam.csv", *args)
     assert files() == before
-    return told.stderr
+    return told
 
 
 def files() -> dict[Path, bytes]:
@@ -102,30 +97,6 @@ def test_the_name_has_the_model_and_every_option_that_changes_the_numbers(
     here.with_name("other.toml").write_text(TOML)
     monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: fabricated.result())
     assert fitted(*options.split()) == [f"fits/foam/{name}"]
-
-
-def test_a_long_name_is_cut_and_stays_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: fabricated.result())
-    given = [f"--fix=s1_{name}={1 / 7}" for name in ("k0", "kc", "eps_a", "kh_plus", "kh_minus")]
-    run(*given, "--fix=s1_eps_c=0.31")
-    names = [Path(place).name for place in fitted(*given, "--fix=s1_eps_c=0.32")]
-    assert len(set(names)) == 2
-    assert all(len(name) <= 120 for name in names)
-
-
-def test_a_default_drive_is_not_named_for_an_impact_either(
-    here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _, test = synthetic_impact()
-    striker = '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\ngravity = false\n'
-    size = f'height = "{test.specimen.height} m"\narea = "{test.specimen.area} m^2"\n'
-    here.with_suffix(".toml").write_text(f"[specimen]\n{size}{striker}")
-    monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: fabricated.result())
-    table = np.column_stack([test.time, test.stress, test.displacement])
-    header = "time (s),stress (Pa),displacement (m)"
-    np.savetxt(here, table, "%.12g", ",", header=header, comments="")
-    assert fitted("--drive", "impact") == ["fits/foam/bistable"]
-    assert "fits/foam/bistable-displacement" in fitted("--drive", "displacement")
 
 
 def test_other_options_and_cycles_get_folders_of_their_own() -> None:
@@ -232,33 +203,14 @@ def test_cycles_one_by_one_share_a_folder_and_are_compared_as_one() -> None:
     assert Path("again/cycles.json").read_bytes() == (place / "cycles.json").read_bytes()
 
 
-def test_a_result_that_appears_during_the_fit_is_left_alone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The new result is written beside it."""
-
-    def fit(*_: object, **__: object) -> ff.FitResult:
-        other = {"model": "linear", "seed": 7}
-        fabricated.result(options=other).save("fits/foam/linear", report=False)
-        return replace(fabricated.result(), seed=1)
-
-    monkeypatch.setattr("foamfit.api.fit", fit)
-    told = run(*FAST)
-    assert told.exit_code == 1
-    assert "it is in fits/foam/linear-" in told.stderr
-    assert content("fits/foam/linear")["options"]["seed"] == 7
-    (beside,) = Path("fits/foam").glob("linear-*")
-    assert content(beside)["seed"] == 1
-
-
 def test_init_overwrites_a_toml_by_force_alone(here: Path) -> None:
     toml, call = here.with_suffix(".toml"), ["init", "foam.csv"]
-    told = CliRunner().invoke(main, call)
-    assert (told.exit_code, told.stdout, toml.read_text()) == (1, "", TOML)
-    assert "foam.toml exists already" in told.stderr
-    assert "--force overwrites it" in told.stderr
-    assert CliRunner().invoke(main, [*call, "--force"]).exit_code == 0
+    told = run_refused(*call)
+    assert "foam.toml exists already" in told
+    assert "--force overwrites it" in told
+    assert toml.read_text() == TOML
+    assert run(*call, "--force").exit_code == 0
     asked = toml.read_text()
     toml.unlink()
-    assert CliRunner().invoke(main, [*call, "--force"]).exit_code == 0
+    assert run(*call, "--force").exit_code == 0
     assert toml.read_text() == asked != TOML

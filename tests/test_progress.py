@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import logging
 import os
 import re
@@ -10,7 +9,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import foamfit as ff
@@ -19,9 +17,6 @@ from foamfit import api
 from foamfit.cli import main
 from foamfit.cli import progress as module
 from foamfit.cli.progress import ProgressLine, progress_line
-from foamfit.one_model import Options
-from foamfit.trust.best_point import BestPoint
-from foamfit.trust.evidence import misfit_of
 
 pty = pytest.importorskip("pty")
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
@@ -110,18 +105,6 @@ def test_nothing_is_shown_where_silence_is_asked_for(
     assert terminal.read() == ""
 
 
-def test_nothing_is_shown_and_nothing_watched_without_a_terminal(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    stream = io.StringIO()
-    monkeypatch.setattr(sys, "stderr", stream)
-    with progress_line(False, "fit") as line:
-        line.progress(0.5, "loop")
-        assert line.watch is None
-        line.tell("72 refits, about 3 s")
-    assert stream.getvalue() == "foamfit: 72 refits, about 3 s\n"
-
-
 @pytest.mark.usefixtures("quick")
 def test_a_sentence_in_between_does_not_run_into_the_line(
     terminal: Terminal, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
@@ -159,47 +142,6 @@ def test_the_line_is_never_wider_than_the_terminal(columns: int) -> None:
         assert told.endswith(f"| {what}")
 
 
-def test_the_best_misfit_is_that_of_all_fitted_curves_and_costs_no_evaluation() -> None:
-    _, test = synthetic_impact()
-    problem = Options().problem(test, "bistable")
-    values = problem.vector()
-    line = ProgressLine(io.StringIO(), "fit")
-    counts = problem.objective.evaluations
-    assert line.watch is not None
-    line.watch(problem, values)
-    assert problem.objective.evaluations == counts
-    best = BestPoint(problem, values)
-    assert line.misfit == pytest.approx(misfit_of(best.problem.objective, best.residual), rel=1e-6)
-    line.progress(0.5, "cycle 2: loop")  # another test begins
-    assert line.misfit is None
-    line.close()
-
-
-@pytest.mark.parametrize(("took", "apart"), [(0.01, 0.5), (0.001, 0.2)])
-def test_simulations_for_the_line_take_a_small_share_of_the_time(
-    took: float, apart: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _, test = synthetic_impact()
-    problem = Options().problem(test, "bistable")
-    now = [0.0]
-    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
-    line = ProgressLine(io.StringIO(), "fit")
-    looks: list[float] = []
-
-    def look(*_: object, **__: object) -> None:
-        looks.append(now[0])
-        now[0] += took
-
-    problem.objective.look = look
-    while now[0] < 10.0:
-        now[0] += 0.001
-        line.watch(problem, np.zeros(8))
-        line.progress(0.1, "loop")
-    # The first interval is excluded, because the first simulation loads the solver.
-    assert np.diff(looks)[1:11] == pytest.approx([took + apart] * 10, abs=0.002)
-    line.close()
-
-
 def test_progress_rises_through_search_and_intervals() -> None:
     _, test = synthetic_impact()
     told: list[tuple[float, str]] = []
@@ -210,10 +152,3 @@ def test_progress_rises_through_search_and_intervals() -> None:
     steps = list(dict.fromkeys(what for _, what in told))
     assert steps[:4] == ["start values", "loop", "curves", "refinement"]
     assert len([what for _, what in told if what == "intervals"]) > 5
-
-
-def test_auto_says_which_model_of_how_many() -> None:
-    _, test = synthetic_impact()
-    told: list[str] = []
-    api.fit(test, model="auto", starts=2, progress=lambda _, what: told.append(what))
-    assert told[0].startswith("model 1 of 11: bistable without damping: ")

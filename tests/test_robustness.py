@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-import fabricated
 import foamfit as ff
 import foamfit.report.figures
 import foamfit.report.summary
-from conftest import AREA, HEIGHT, small_pictures, synthetic_impact, synthetic_loop
+from conftest import AREA, HEIGHT, run, small_pictures, synthetic_impact, write_measurement
 from foamfit import one_model
-from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Outliers
 from foamfit.fitting.curves import default_weights
 from foamfit.fitting.objective import Objective
 from foamfit.report.comparison import compare, comparison_text
 from foamfit.report.folder import load_result
 from foamfit.report.plots import plot_fit
-from foamfit.report.summary import render_report, summary_text
+from foamfit.report.summary import summary_text
 from foamfit.springs.model import Model
 
 BISTABLE = Model.parse("bistable")
@@ -49,20 +45,6 @@ def spoilt_impact() -> tuple[ff.BistableSpring, Measurement, np.ndarray]:
     left_out = np.isin(np.arange(test.time.size), at)
     found = Outliers(left_out, test.time[at], np.full(4, 9e6))
     return spring, replace(test, outliers={"stress": found}), at
-
-
-def test_what_stands_at_an_outlier_does_not_matter():
-    spring, test, at = spoilt_impact()
-    changed = replace(test, stress=np.where(test.outliers["stress"].left_out, 7e5, test.stress))
-    weights = default_weights(test, "impact")
-    one, other = (Objective(t, BISTABLE, "impact", weights) for t in (test, changed))
-    values = np.array([*spring.seven, 0.0, 0.0, *(one.usual[name] for name in one.nuisance)])
-    np.testing.assert_array_equal(one.residual(values), other.residual(values))
-    assert one.sizes == (401 - at.size, 401)
-    simulated = one.simulate(values)
-    assert one.misfit(simulated)["stress_time"] == pytest.approx(
-        other.misfit(simulated)["stress_time"], rel=1e-12
-    )
 
 
 def test_outliers_are_in_the_result_and_crossed_in_the_figure(tmp_path, monkeypatch):
@@ -94,14 +76,8 @@ def test_a_file_with_spikes_and_gaps_gives_the_parameters_of_the_spring(tmp_path
     stress[spikes] += 15 * test.noise.stress
     stress[[210, 211]] = 0.0
     motion[333] = 0.0
-    path = tmp_path / "spoilt.csv"
-    table = np.column_stack([test.time, stress, motion])
-    np.savetxt(path, table, delimiter=",", header="time_s,stress_Pa,displacement_m", comments="")
-    path.with_suffix(".toml").write_text(
-        f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n'
-        '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
-    )
-    read = ff.read_test(path)
+    spoilt = replace(test, stress=stress, displacement=motion)
+    read = ff.read_test(write_measurement(tmp_path / "spoilt.csv", spoilt))
     assert read.outliers["stress"].at.size == 5
     assert read.outliers["displacement"].at.size == 1
     said = [note for note in read.notes if "spikes or gaps" in note]
@@ -148,16 +124,6 @@ def test_a_shift_between_force_and_motion_is_warned_of_and_fitted(late):
     assert "time shift Δt" in summary_text(result)
 
 
-def test_no_shift_is_warned_of_where_there_is_none():
-    _, test = synthetic_impact(samples=201)
-    plain, shifted = (
-        ff.fit(test, time_shift=shift, starts=2, intervals="local") for shift in (False, True)
-    )
-    assert not [w for w in plain.warnings if "--time-shift" in w]
-    shifted = shifted.parameters["time_shift"]
-    assert abs(shifted.value) < 3 * shifted.stderr
-
-
 @pytest.mark.parametrize("contact", ["file", "stress", "motion"])
 def test_the_curves_of_a_shifted_test_are_those_that_it_shows(contact):
     """Time zero comes from the file, the onset of stress (zero displacement), or the motion."""
@@ -188,19 +154,6 @@ def test_the_curves_of_a_shifted_test_are_those_that_it_shows(contact):
         assert off.max() < 1e-6
 
 
-def test_a_slow_test_in_time_has_a_shift_too():
-    _, loop = synthetic_loop()
-    time = np.linspace(0.0, 4.0, loop.stress.size)
-    late = 0.05
-    seen = np.interp(time - late, time, loop.displacement)
-    test = replace(loop, time=time, displacement=seen)
-    result = ff.fit(test, time_shift=True, starts=4, intervals="local")
-    item = result.parameters["time_shift"]
-    assert item.value == pytest.approx(late, abs=max(3 * item.stderr, 2e-3))
-    assert result.drive == "displacement"
-    assert any("relaxes" in note for note in result.notes)
-
-
 @pytest.mark.parametrize(
     ("changed", "missing"),
     [({"time": None, "striker": None}, "no time"), ({"motion": "integrated from force"}, "motion")],
@@ -212,24 +165,6 @@ def test_a_shift_without_two_channels_in_time_is_refused(changed, missing):
     assert "time shift" in str(caught.value)
 
 
-def test_the_command_fits_a_shift_and_refuses_it_without_time(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    test = fabricated_csv(tmp_path)
-    monkeypatch.setattr("foamfit.api.FitResult.save", lambda *_, **__: None)
-    call = ["fit", str(test), "--starts", "2", "--json", "--time-shift"]
-    out = CliRunner().invoke(main, call)
-    assert out.exit_code == 0
-    content = json.loads(out.stdout)
-    assert content["parameters"]["time_shift"]["unit"] == "s"
-    rows = [line.split(",")[1:] for line in test.read_text().splitlines()[:200]]
-    (tmp_path / "slow.csv").write_text("\n".join(",".join(row) for row in rows))
-    (tmp_path / "slow.toml").write_text('[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n')
-    out = CliRunner().invoke(main, ["fit", "slow.csv", "--time-shift"])
-    assert out.exit_code == 1
-    assert "it has no time" in out.stderr
-    assert len(out.stderr.splitlines()) == 1
-
-
 # ----------------------------------------------------------------------------------- interruption
 
 
@@ -237,7 +172,7 @@ def test_a_stopped_fit_is_marked_everywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     small_pictures(monkeypatch)
     test = fabricated_csv(tmp_path)
-    out = CliRunner().invoke(main, ["fit", str(test), "--max-time", "0.02", "--out", "stopped"])
+    out = run("fit", str(test), "--max-time", "0.02", "--out", "stopped")
     assert out.exit_code in (0, 2)
     assert "stopped by the time limit" in out.stdout.splitlines()[0]
     content = load_result(tmp_path / "stopped")
@@ -257,43 +192,14 @@ def test_sigterm_keeps_the_best_so_far(tmp_path, monkeypatch):
     end = partial(signal.raise_signal, signal.SIGTERM)
     monkeypatch.setattr(one_model, "settle_ends", lambda *_: end())  # stop after the search
     call = ["fit", str(fabricated_csv(tmp_path)), "--starts", "2", "--out", "stopped"]
-    out = CliRunner().invoke(main, call)
+    out = run(*call)
     assert (out.exit_code, out.stderr) == (0, "")
     assert "stopped by SIGTERM" in out.stdout.splitlines()[0]
     assert load_result(tmp_path / "stopped")["stopped"] == "SIGTERM"
     monkeypatch.setattr(one_model, "make_problem", lambda *_, **__: end())
-    out = CliRunner().invoke(main, [*call, "--quiet"])
+    out = run(*call, "--quiet")
     assert (out.exit_code, out.stderr.strip()) == (143, "foamfit: ended by SIGTERM")
 
 
-def test_the_figure_of_a_stopped_fit_says_so():
-    stopped = fabricated.result(stopped="Ctrl-C")
-    assert "stopped by Ctrl-C" in plot_fit(stopped).get_suptitle().replace("\n", " ")
-    assert "stopped" not in plot_fit(fabricated.result()).get_suptitle()
-    assert "stopped by Ctrl-C" in render_report(stopped, fabricated.no_figures())
-    assert json.loads(json.dumps(fabricated.result().to_json_dict()))["stopped"] is None
-
-
-def test_a_stopped_fit_is_never_ok(monkeypatch):
-    from foamfit.fitting.search import SearchStoppedError
-    from foamfit.trust import settle
-
-    def stop(*_: object, **__: object) -> None:
-        raise SearchStoppedError
-
-    monkeypatch.setattr(settle, "refine", stop)
-    result = ff.fit(synthetic_impact(samples=201)[1], starts=2)
-    assert result.stopped == "the time limit"
-    assert result.status == "warnings"
-
-
 def fabricated_csv(folder):
-    _, test = synthetic_impact(samples=201)
-    path = folder / "foam-1-model-1.csv"
-    table = np.column_stack([test.time, test.stress, test.displacement])
-    np.savetxt(path, table, delimiter=",", header="time_s,stress_Pa,displacement_m", comments="")
-    path.with_suffix(".toml").write_text(
-        f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n'
-        '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
-    )
-    return path
+    return write_measurement(folder / "foam-1-model-1.csv", synthetic_impact(samples=201)[1])

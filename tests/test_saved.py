@@ -109,6 +109,7 @@ def test_results_of_earlier_versions_are_read(folder: str) -> None:
             lambda text: text.replace('"kind": "bistable"', '"kind": "x"'),
             "'x' is not a spring",
         ),
+        ("fit.json", lambda text: text.replace('"value": 5500000.0', '"value": "x"'), "wrong kind"),
         ("curves.csv", lambda text: text[: len(text) // 2], "rows of 601"),
         ("curves.csv", lambda text: text.replace("fitted stress", "stress"), "fitted stress"),
         ("curves.csv", lambda text: text.replace("\n0.0,", "\nzero,", 1), "damaged"),

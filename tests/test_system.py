@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -63,22 +62,3 @@ def test_no_other_module_uses_what_windows_lacks():
                 with open(path, encoding="utf-8") as file:
                     text = file.read()
                 assert not [word for word in lacking if word in text], path
-
-
-def test_a_handler_of_the_portable_way_calls_the_loop(portable):
-    import asyncio
-
-    async def run() -> float:
-        ending = asyncio.Event()
-        before = {number: signal.getsignal(number) for number in system.ENDING}
-        try:
-            system.at_end(asyncio.get_running_loop(), ending.set)
-            began = time.monotonic()
-            signal.raise_signal(signal.SIGTERM)
-            await asyncio.wait_for(ending.wait(), 10)
-            return time.monotonic() - began
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    assert asyncio.run(run()) < 10

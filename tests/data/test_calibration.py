@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from conftest import DATA, EXPERIMENTS, needs_data
-from foamfit.cli import main
+import rig
+from conftest import DATA, needs_data, run
 from foamfit.data.calibration import contradictions
 from foamfit.data.csv_file import read_test
-from foamfit.fitting.curves import choose_drive
-
-sys.path.insert(0, str(EXPERIMENTS / "recovery"))
-import rig
 
 RIGHT = {
     "any zero": rig.Impact(),
@@ -124,50 +118,6 @@ def test_the_printed_line_keeps_column_and_unit_of_the_force(entry: str, tmp_pat
     assert quantities(path) == []
 
 
-@pytest.mark.parametrize(
-    ("spread", "found"), [("", True), (" ± 5 %", False), (" ± 1 %", True), (" ± 0.2 %", True)]
-)
-def test_a_stated_deviation_is_the_measure(spread: str, found: bool, tmp_path: Path) -> None:
-    record = rig.impact(rig.Impact(), 5)
-    stated = f"{0.94 * record.rig.velocity:.8g} m/s{spread}"
-    path = rig.write(replace(record, toml_velocity=stated), tmp_path)
-    assert quantities(path) == ["velocity"] * found
-
-
-def test_a_clipped_force_contradicts_nothing(tmp_path: Path) -> None:
-    record = rig.impact(rig.Impact(noise=1e-3), 6)
-    force = record.channels["force"]
-    limit = force.min() + 0.6 * np.ptp(force)
-    clipped = replace(record, channels=record.channels | {"force": np.minimum(force, limit)})
-    test = read_test(rig.write(clipped, tmp_path))
-    assert test.outliers["stress"].clipped_at is not None
-    assert contradictions(test) == ()
-
-
-@pytest.mark.parametrize("late", [0.02, 0.05])
-def test_a_force_that_lags_is_a_delay_and_no_wrong_scale(late: float, tmp_path: Path) -> None:
-    for seed in (1, 2, 3):
-        record = rig.impact(rig.Impact(), seed)
-        lag = late * record.course.end
-        shifted = np.interp(record.time - lag, record.time, record.channels["force"])
-        lagging = replace(record, channels=record.channels | {"force": shifted})
-        test = read_test(rig.write(lagging, tmp_path))
-        (one,) = contradictions(test)
-        assert one.quantity == "time_shift"
-        assert one.ratio == pytest.approx(-lag, abs=one.limit)
-        assert choose_drive(test) == "impact"
-
-
-def test_a_striker_that_falls_before_contact_has_the_velocity_at_contact(tmp_path: Path) -> None:
-    """Its mean velocity over a long flight is 1 % less."""
-    record = rig.impact(rig.Impact(gravity=True), 20006)
-    test = read_test(rig.write(record, tmp_path))
-    speed, error = test.flight
-    assert abs(speed - record.rig.velocity) < 4.0 * error < 0.005 * speed
-    assert contradictions(test) == ()
-    assert not any("given as" in note for note in test.notes)
-
-
 @pytest.mark.parametrize("share", [0.05, -0.03])
 def test_a_linear_drift_of_the_force_is_taken_off(share: float, tmp_path: Path) -> None:
     for seed in (1, 2):
@@ -188,7 +138,7 @@ def test_check_says_what_contradicts_and_the_line_that_settles_it(tmp_path: Path
     record = rig.impact(rig.Impact(before=0.4), 1)
     right = record.rig.velocity
     path = rig.write(replace(record, toml_velocity=f"{0.9 * right:.8g} m/s"), tmp_path)
-    out = CliRunner().invoke(main, ["check", str(path)])
+    out = run("check", str(path))
     assert out.exit_code == 0
     told = " ".join(out.output.split())
     assert f"the velocity is given as {0.9 * right:.4g} m/s, the striker moves at" in told

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import re
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from conftest import EXPERIMENTS
+import rig
 from foamfit.data.csv_file import read_test
 from foamfit.data.energy import audit
 from foamfit.data.measurement import Record, Specimen, Striker
-from foamfit.data.noise import with_noise
 from foamfit.data.prepare import condition
 from foamfit.errors import InputError
 from foamfit.fitting.problem import make_params
-
-sys.path.insert(0, str(EXPERIMENTS / "recovery"))
-import rig
 
 HEIGHT, AREA, MASS, VELOCITY = 10e-3, 1e-4, 0.5, 2.0
 DURATION = 4e-3
@@ -33,8 +28,7 @@ SPECIMEN, STRIKER = Specimen(HEIGHT, AREA), Striker(MASS, VELOCITY)
 def noise(rng, n, tau):
     """Return noise of unit variance with an autocorrelation time of `tau` samples."""
     rho = (tau - 1) / (tau + 1)
-    white = rng.standard_normal(n + 400)
-    return lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], white)[400:]
+    return lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], rng.standard_normal(n + 400))[400:]
 
 
 def record(
@@ -188,22 +182,6 @@ def test_a_motion_counts_before_contact_only_in_flight():
 # Channels.
 
 
-def test_an_acceleration_is_kept_where_there_is_no_displacement():
-    done = run(record("FA", zeros=ZEROS[1]))
-    assert done.derived == ("displacement",)
-    assert done.motion == "integrated from acceleration"
-    truth = np.where(done.time > 0, BRAKED * np.sin(OMEGA * done.time), 0.0)
-    inside = done.time < DURATION
-    assert np.abs(done.acceleration - truth)[inside].max() < 0.02 * BRAKED
-    lead = done.time < 0
-    np.testing.assert_allclose(done.displacement[lead], VELOCITY * done.time[lead], rtol=1e-9)
-    assert run(record("FW")).acceleration is None
-    few = with_noise(run(record("FA", before=0, phase=0.0)))
-    assert few.noise.of("acceleration").sigma == pytest.approx(0.003 * BRAKED, rel=0.2)
-    stated = replace(few, noise=replace(few.noise, stress=1.0))
-    assert stated.noise.of("acceleration") == few.noise.of("acceleration")
-
-
 def write(folder, header, *columns, velocity=f"{VELOCITY} m/s"):
     path = folder / "test.csv"
     np.savetxt(path, np.column_stack(columns), delimiter=",", header=header, comments="")
@@ -233,16 +211,6 @@ def test_a_file_of_the_motion_alone_gives_a_derived_stress(tmp_path, gauge):
     other = read_test(turned)
     assert other.turned == ("displacement",)
     np.testing.assert_allclose(other.stress, done.stress, atol=1e-9 * PEAK)
-
-
-def test_a_file_of_the_velocity_alone_gives_motion_and_stress(tmp_path):
-    given = record("FW", n=1000, level=0.0)
-    velocity = np.gradient(given.displacement, given.time)
-    velocity += 0.01 * np.random.default_rng(0).standard_normal(velocity.size)
-    done = read_test(write(tmp_path, "time (s),velocity (m/s)", given.time, velocity))
-    assert done.derived == ("stress",)
-    assert done.motion == "integrated from velocity"
-    assert done.stress.max() == pytest.approx(PEAK, rel=0.1)
 
 
 def test_a_start_from_which_the_motion_passes_the_height_is_moved():

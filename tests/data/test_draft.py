@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from conftest import DATA
-from foamfit.cli import main
+from conftest import DATA, needs_data, run, run_refused
 
 T = np.linspace(0.0, 2.0, 201)
 W = 4.0 * np.sin(0.5 * np.pi * T)
@@ -28,7 +26,7 @@ def drafted(folder: Path, *head: str, columns: tuple[np.ndarray, ...] = (T, F, W
 
 
 def initialised(path: Path) -> list[str]:
-    out = CliRunner().invoke(main, ["init", str(path)])
+    out = run("init", str(path))
     assert out.exit_code == 0, out.stderr
     text = path.with_suffix(".toml").read_text(encoding="utf-8")
     tomllib.loads(text)
@@ -106,14 +104,11 @@ def test_what_no_header_says_is_proposed_only_without_an_alternative(
 def test_init_writes_nothing_for_a_file_without_a_table(tmp_path: Path, content: str) -> None:
     path = tmp_path / "test.csv"
     path.write_text(content)
-    out = CliRunner().invoke(main, ["init", str(path)])
-    assert out.exit_code == 1
-    assert out.stderr.startswith(f"foamfit: {path}: ")
-    assert out.stderr.count("\n") == 1
+    assert run_refused("init", path).startswith(f"foamfit: {path}: ")
     assert not path.with_suffix(".toml").exists()
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are not here")
+@needs_data
 @pytest.mark.parametrize(
     ("name", "entries", "never"),
     [

@@ -9,8 +9,7 @@ import pytest
 from conftest import refused
 from foamfit.data.csv_file import read_test
 from foamfit.data.frames import Frames, join
-from foamfit.data.measurement import Record, Specimen
-from foamfit.data.prepare import condition
+from foamfit.data.measurement import Record
 from foamfit.fitting.problem import make_problem
 from foamfit.study.batch_work import fingerprint
 from foamfit.study.test_files import find_tests
@@ -125,19 +124,6 @@ def test_masses_inside_and_columns_of_the_toml(tmp_path):
     assert any(n.startswith("camera.csv: Read") and "not used: 'D'" in n for n in test.notes)
 
 
-def test_few_frames_and_pauses_are_joined_by_straight_lines():
-    t = clock(1e5)
-    few = np.linspace(0.0, LAST, 5)
-    record = Record(t, np.sin(np.pi * t / LAST), None)
-    joined = join(record, Frames("camera.csv", few, {"displacement": press(few)}))
-    assert joined.displacement == pytest.approx(np.interp(t, few, press(few)))
-    at = np.delete(clock(1e4), slice(10, 30))
-    joined = join(record, Frames("camera.csv", at, {"displacement": press(at)}))
-    pause = (t > at[9]) & (t < at[10])
-    assert joined.displacement[pause] == pytest.approx(np.interp(t[pause], at, press(at)))
-    assert joined.displacement[~pause] == pytest.approx(press(t[~pause]), abs=1e-6)
-
-
 def test_a_spike_is_no_frame(tmp_path):
     at = clock(1e4)
     motion = {"t (us)": 1e6 * at, "displacement (um)": 1e6 * press(at)}
@@ -147,30 +133,6 @@ def test_a_spike_is_no_frame(tmp_path):
     assert taken(test).size == 40
     assert test.displacement == pytest.approx(press(test.time), abs=1e-6)
     assert any("1 frame of the displacement stood out" in note for note in test.notes)
-
-
-@pytest.mark.parametrize(("rate", "several"), [(1e4, False), (5e5, True)])
-def test_blocks_of_samples_keep_the_frames(rate, several):
-    """3001 samples are averaged in 1001 blocks, with 0.04 or 2 frames each."""
-    t = LAST * np.arange(3001) / 3000
-    at = clock(rate)
-    noise = 1e-5 * np.random.default_rng(2).standard_normal(at.size)
-    record = Record(t, 2e6 * np.sin(np.pi * t / LAST), None)
-    joined = join(record, Frames("camera.csv", at, {"displacement": press(at) + noise}))
-    test = condition(joined, Specimen(0.01, 1e-4))
-    assert 998 <= test.time.size <= 1001  # some samples lie outside of the cycle
-    level = test.noise.of("displacement")
-    if several:
-        assert test.sampled == {}
-        off = test.displacement - press(test.time)
-        assert np.std(off) == pytest.approx(1e-5 / np.sqrt(2), rel=0.15)
-        assert level.sigma == pytest.approx(np.std(off), rel=0.2)
-    else:
-        assert taken(test).size in (40, 41)
-        inside = np.interp(test.time, joined.time, joined.displacement)
-        assert test.displacement == pytest.approx(inside, abs=1e-12)
-        assert level.sigma == pytest.approx(1e-5, rel=0.4)
-        assert "averaged" not in level.how
 
 
 # Fits.

@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import pytest
 
-from conftest import DATA
+from conftest import DATA, needs_data, specimen_toml
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Record, Specimen
 from foamfit.data.prepare import condition
@@ -164,16 +164,6 @@ def test_a_true_hold_is_no_standstill(ramps, every, digit, noise):
     assert not notes(conditioned(shown, stress, noise))
 
 
-@pytest.mark.parametrize("digit", [0.0, 0.03, 0.3])
-@pytest.mark.parametrize("samples", [60, 400, 4000])
-@pytest.mark.parametrize("every", [1, 5])
-def test_a_smooth_turn_is_no_standstill(samples, digit, every):
-    w = TOP * np.sin(np.linspace(0.0, np.pi, samples)) ** 2
-    shown = held(w, every)
-    shown = np.round(shown / digit) * digit if digit else shown
-    assert not notes(conditioned(shown, relaxing_stress(w), 0.001))
-
-
 # --------------------------------------------------------------------------------------- in figures
 
 
@@ -188,18 +178,13 @@ def test_a_gauge_that_slips_after_a_hold_at_constant_stress_has_not_stood_still(
 # ------------------------------------------------------------------------------------ real records
 
 
-@pytest.mark.skipif(not (DATA / "shoe-foam-twins").is_dir(), reason="the records are not here")
+@needs_data
 def test_the_gauge_of_the_shoe_foams_stands_still_at_the_top(tmp_path):
     """In ten tests (arXiv:2602.12694) 34 to 76 samples stand still before a jump of 0.4 to 1 %."""
     with (DATA / "shoe-foam-twins" / "specimens.csv").open() as table:
         specimens = list(csv.DictReader(table))
     for specimen in specimens[::3]:
-        toml = tmp_path / "test.toml"
-        toml.write_text(
-            f'[specimen]\nheight = "{specimen["height_mm"]} mm"\n'
-            f'diameter = "{specimen["diameter_mm"]} mm"\n'
-            '[columns]\ndisplacement = { column = "Gap (um)", counts_down = true }\n'
-        )
+        toml = specimen_toml(tmp_path, specimen["height_mm"], specimen["diameter_mm"])
         test = read_test(DATA / "shoe-foam-twins" / f"{specimen['test']}_raw.txt", toml)
         (note,) = notes(test)
         ((start, end),) = test.standstills

@@ -115,53 +115,8 @@ def test_data_without_noise_stay_as_they_are(shape, rounding):
     assert reversal(motion, t) == 0.0
 
 
-def test_a_sharp_turn_between_samples_without_noise_is_where_the_lines_meet():
-    t = np.linspace(0.0, 1.0, 700)
-    motion = follow(t, truth("triangle", t), given(0.0))
-    np.testing.assert_allclose(motion.turns, 0.4873, atol=1e-9)
-    np.testing.assert_allclose(motion.at(motion.turns), 1.0, atol=1e-9)
-
-
 def test_an_unknown_noise_is_found():
     for shape in ("triangle", "haversine", "trapezoid"):
         t, _, noisy = measured(shape, 1000, 0.002, 1)
         for level in (estimated_noise(noisy), NoiseLevel(0.006, False, ""), given(0.0005)):
             assert follow(t, noisy, level).sigma == pytest.approx(0.002, rel=0.12)
-
-
-def test_steps_of_a_digitiser_are_noise():
-    t = np.linspace(0.0, 1.0, 1000)
-    true = truth("haversine", t)
-    values = np.round(true / 0.004) * 0.004
-    motion = follow(t, values, estimated_noise(values))
-    assert motion.turns.size == 1
-    assert motion.sigma == pytest.approx(0.004 / 12**0.5, rel=0.15)
-    assert np.abs(motion.at(t) - true).max() < 0.002
-
-
-def test_samples_that_do_not_count_change_nothing():
-    t, true, noisy = measured("triangle", 600, 0.001, 5)
-    counts = np.ones(600, dtype=bool)
-    counts[[0, 100, 101, 102, 350, 599]] = False
-    spoilt = np.where(counts, noisy, 7.0)
-    motion, same = (follow(t, values, given(0.001), counts) for values in (noisy, spoilt))
-    np.testing.assert_array_equal(motion.at(t), same.at(t))
-    assert np.abs(motion.at(t) - true).max() < 0.001
-
-
-@pytest.mark.parametrize("n", [10, 12, 20, 60])
-def test_short_records_are_followed(n):
-    for seed in range(10):
-        t, true, noisy = measured("triangle", n, 0.002, seed)
-        motion = follow(t, noisy, given(0.002))
-        assert motion.turns.size == 1
-        assert np.abs(motion.at(t) - true).max() < 0.02
-
-
-def test_correlated_noise_leaves_more_uncertain():
-    t, _, noisy = measured("haversine", 800, 0.001, 8)
-    white, slow = (
-        np.linalg.norm(follow(t, noisy, NoiseLevel(0.001, True, "", time)).modes(t), axis=1).mean()
-        for time in (1.0, 4.0)
-    )
-    assert 1.5 < slow / white < 2.2

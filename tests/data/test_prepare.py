@@ -1,25 +1,15 @@
 """Each step from raw samples to one loading and unloading, on pulses with known values."""
 
-import contextlib
-import functools
-import re
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from conftest import EXPERIMENTS
-from foamfit import read_test
-from foamfit.data.cycles import find_turns
 from foamfit.data.energy import audit
 from foamfit.data.measurement import Record, Specimen, Striker, Window
 from foamfit.data.outliers import fill_staircase
 from foamfit.data.prepare import condition, thin
 from foamfit.errors import InputError
-
-sys.path.insert(0, str(EXPERIMENTS / "recovery"))
-import rig
 
 SPECIMEN = Specimen(height=1.19e-3, area=1.9635e-5, mass=5.56e-6)
 STRIKER = Striker(mass=7e-3, velocity=1.75)
@@ -70,92 +60,6 @@ def error_of_motion(conditioned):
 # Where contact starts.
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.003, 0.01])
-@pytest.mark.parametrize(
-    "w", ["measured", "at rest before contact", "from another zero", "missing"]
-)
-def test_contact_is_found_after_a_pretrigger(noise, w):
-    conditioned = run(impact(before=0.4, after=0.4, noise=noise, offset=0.03, origin=5e-3, w=w))
-    assert conditioned.origins["contact_time"] == pytest.approx(5e-3, abs=0.012 * DURATION)
-    # a tenth of the contact duration is kept before contact
-    assert conditioned.time[0] == pytest.approx(-0.1 * DURATION, rel=0.05)
-    assert conditioned.time[-1] == pytest.approx(DURATION, rel=0.05)
-    assert error_of_motion(conditioned) < 0.015
-    # the offset of the sensor is subtracted
-    assert conditioned.stress[-3:].mean() == pytest.approx(0, abs=0.02 * PEAK)
-    assert any("offset" in note for note in conditioned.notes)
-    assert any("are cut" in note for note in conditioned.notes)
-
-
-# Records of the recovery study: random springs, 1 % noise, contact at the first sample. With these
-# seeds branch a is so soft that its stress lies below the noise. `CLASSES` contains pairs of
-# correlation time and record length, both in samples.
-SOFT = (12, 27, 32)
-CLASSES = [(1.0, 300), (8.0, 300), (1.0, 5000), (8.0, 5000)]
-
-
-@functools.cache
-def in_white_noise(samples, seed):
-    return rig.impact(rig.Impact(trimmed=True, samples=samples), seed)
-
-
-def at_contact(tau, samples, seed):
-    """Return a record that starts at contact, without offsets.
-
-    The noise-free curves are the same for every correlation time.
-    """
-    record = in_white_noise(samples, seed)
-    channels, _ = rig.noisy(record.clean, record.noise, 1.0, tau, seed)
-    return replace(record, setup=replace(record.setup, tau=tau), channels=channels)
-
-
-def in_memory(record):
-    """Return the test of a record as if read from its files, without writing them."""
-    own = record.rig
-    given = Record(
-        record.time, record.channels["force"] / own.area, record.channels["displacement"]
-    )
-    specimen = Specimen(height=own.heights[0], area=own.area)
-    return condition(given, specimen, striker=Striker(mass=own.mass, velocity=own.velocity))
-
-
-@pytest.mark.parametrize(("tau", "samples"), CLASSES)
-def test_nothing_is_cut_or_taken_off_where_contact_is_the_first_sample(tmp_path, tau, samples):
-    for seed in SOFT:
-        record = at_contact(tau, samples, seed)
-        test = read_test(rig.write(record, tmp_path))
-        assert not re.search(r"[1-9]\d* samples before and", " ".join(test.notes))
-        # only the stress may be corrected, by its zero at the end after the striker has left
-        taken = [note for note in test.notes if "taken off" in note]
-        assert all(note.startswith("The stress at the end of the record") for note in taken)
-        assert len(taken) == ("stress" in test.zeros)
-        assert abs(test.origins["stress_zero"]) <= 4.0 * test.zeros.get("stress", 0.0)
-        if len(test.time) > 0.4 * samples:  # not thinned
-            kept = slice(len(test.time))
-            written = record.channels["displacement"][kept]
-            np.testing.assert_allclose(test.time, record.time[kept], atol=1e-14)
-            np.testing.assert_allclose(test.displacement, written, rtol=1e-8, atol=1e-14)
-        stress = record.channels["force"] / record.rig.area
-        done = condition(Record(record.time, stress, None), test.specimen, striker=test.striker)
-        assert done.contact == "file"  # from the stress alone
-
-
-@pytest.mark.parametrize(("tau", "samples"), CLASSES)
-def test_the_zero_at_the_end_of_a_record_is_as_far_off_as_it_says(tau, samples):
-    """Contact ends with a low stress, in white or correlated noise; the true zero is 0."""
-    off = []
-    for seed in range(1, 13):
-        test = in_memory(at_contact(tau, samples, seed))
-        if "stress" in test.zeros:
-            off.append(test.origins["stress_zero"] / test.zeros["stress"])
-    assert len(off) > 7
-    off = np.sort(np.abs(off))
-    if (tau, samples) == (8.0, 300):  # in one record a soft start is taken for rest
-        off = off[:-1]
-    assert off[-1] < 3.5
-    assert np.sqrt(np.mean(np.square(off))) < 1.4
-
-
 @pytest.mark.parametrize("missing", [3, 30])
 @pytest.mark.parametrize("origin", [0.0, -4.0, 1.7e3])
 def test_the_rise_is_extrapolated_back_where_the_first_samples_are_missing(missing, origin):
@@ -201,13 +105,6 @@ def test_contact_ends_before_a_second_bounce(noise):
     assert end == pytest.approx(DURATION, rel=0.04)
 
 
-@pytest.mark.parametrize("noise", [0.1, 0.3])
-def test_heavy_noise_does_not_stall_the_search_for_the_end(noise):
-    record = impact(100, before=0.5, after=0.5, noise=noise)
-    with contextlib.suppress(InputError):  # strains may exceed one
-        run(record)
-
-
 # Displacement.
 
 
@@ -238,14 +135,6 @@ def test_a_staircase_becomes_its_ramp():
     assert np.abs(filled.displacement - w)[:-5].max() < 0.02 * np.abs(held - w).max()
     assert "5 samples" in filled.notes[0]
     assert np.flatnonzero(filled.sampled["displacement"]).tolist() == list(range(0, 1000, 5))
-
-
-def test_a_true_hold_stays_a_hold():
-    t = np.arange(1000) * 1e-3
-    w = np.interp(t, [0, 0.4, 0.6, 1.0], [0, 1e-4, 1e-4, 0])
-    held = w[np.arange(1000) // 5 * 5]
-    filled = fill_staircase(Record(t, w, held))
-    assert np.abs(filled.displacement - w)[:-5].max() < 1e-3 * w.max()
 
 
 # Masses inside.
@@ -293,15 +182,6 @@ def cycles(n=3, hold=50):
     w = np.interp(np.arange(corners[-1]), corners, heights)
     t = np.arange(w.size) * 0.01
     return Record(t, 1e9 * w, w - 5e-3)
-
-
-@pytest.mark.parametrize("cycle", [1, 2, 3])
-def test_one_cycle_of_a_slow_test_is_kept(cycle):
-    conditioned = condition(cycles(), SPECIMEN, window=Window(cycle=cycle))
-    assert (conditioned.cycle, conditioned.cycles) == (cycle, (1, 2, 3))
-    assert 440 <= len(conditioned.stress) <= 510
-    assert conditioned.time[0] == pytest.approx(0, abs=0.011)
-    assert any(f"Cycle {cycle} of 3" in note for note in conditioned.notes)
 
 
 def test_cycles_are_told_from_each_other_however_far_the_machine_came_from():
@@ -378,27 +258,6 @@ def test_a_cycle_that_is_not_there_is_refused():
         run(impact(), cycle=2)
 
 
-def test_a_slow_test_without_unloading_says_so():
-    record = cycles(1).rows(slice(0, 300))
-    assert any("no unloading" in note for note in condition(record, SPECIMEN).notes)
-
-
-def test_the_approach_of_a_slow_test_is_cut():
-    w = np.concatenate([np.linspace(-1e-3, 1e-3, 400), np.linspace(1e-3, 0, 200)]) + 7e-3
-    stress = 1e9 * np.maximum(w - 7e-3, 0)
-    conditioned = condition(Record(np.arange(600) * 0.01, stress, w), SPECIMEN)
-    assert conditioned.displacement.max() == pytest.approx(1e-3, rel=0.01)
-    assert conditioned.displacement[0] == pytest.approx(0, abs=1e-5)
-
-
-def test_adhesion_is_kept_and_noted():
-    record = cycles(1)
-    stress = record.stress - 0.1 * record.stress.max() * (np.arange(len(record)) > 450)
-    conditioned = condition(Record(record.time, stress, record.displacement), SPECIMEN)
-    assert conditioned.stress.min() < 0
-    assert any("kept" in note and "-" in note for note in conditioned.notes)
-
-
 # Window, thinning, checks.
 
 
@@ -439,22 +298,3 @@ def test_what_smells_wrong_is_noted(specimen, striker, words):
     told = (*done.notes, *audit(done).warnings())
     assert any(note.startswith("Check:") and words in note for note in told)
     assert not any(note.startswith("Check:") for note in run(impact()).notes)
-
-
-def test_strain_beyond_one_is_refused():
-    with pytest.raises(InputError, match="beyond one"):
-        condition(impact(), Specimen(3e-4, 1.9635e-5), striker=STRIKER)
-
-
-@pytest.mark.parametrize("n", [1, 2, 50, 3000])
-@pytest.mark.parametrize("back", [0.0, 1.0, 30.0, 1e3])
-def test_a_motion_turns_where_it_goes_back_by_more_than_so_much(n, back):
-    values = np.round(np.cumsum(np.random.default_rng(n).normal(size=n)), 1)
-    turns, up, best = list[int](), True, 0
-    for i, value in enumerate(values):
-        if (value > values[best]) if up else (value < values[best]):
-            best = i
-        elif abs(value - values[best]) > back:
-            turns, up, best = [*turns, best], not up, i
-    turns += [best] if up or not turns else []
-    np.testing.assert_array_equal(find_turns(values, back), turns)

@@ -43,19 +43,3 @@ def test_the_standard_error_covers_the_true_contact(kind, noise, rows):
         off.append((found.time - CONTACT) / found.error)
     assert np.max(np.abs(off)) < 4.0
     assert np.sqrt(np.mean(np.square(off))) < 1.7
-
-
-def test_a_kink_without_noise_is_found_within_a_sample():
-    time = np.linspace(0.0, 1.37, 1371)
-    values = rise("kink", time - CONTACT)
-    found = rise_of(time, values, estimated_noise(values), 368, 0.0)
-    assert found.time == pytest.approx(CONTACT, abs=1e-3)
-    assert found.error < 1e-3
-
-
-def test_a_soft_start_leaves_the_contact_more_open_than_a_kink():
-    time = np.linspace(0.0, 1.37, 1371)
-    noise = 3e-3 * np.random.default_rng(1).standard_normal(time.size)
-    kink, soft = (rise(kind, time - CONTACT) + noise for kind in ("kink", "soft"))
-    errors = [rise_of(time, y, estimated_noise(y), 360, 1e-4).error for y in (kink, soft)]
-    assert errors[1] > 3.0 * errors[0]

@@ -9,15 +9,12 @@ from __future__ import annotations
 import itertools
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import fabricated
-from conftest import DATA, refused
-from foamfit.cli import main
+from conftest import DATA, needs_data, refused, run, specimen_toml
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.report.summary import summary_text
@@ -122,6 +119,7 @@ def test_adhesion_at_the_end_is_kept(tmp_path: Path) -> None:
     force[-15:] = -8.0
     plain = read_test(written(tmp_path, time_s=t, force_N=force, displacement_mm=w))
     assert (plain.turned, plain.stress.min()) == ((), pytest.approx(-8e4))
+    assert any("kept" in note and "-" in note for note in plain.notes)
     test = read_test(written(tmp_path, time_s=t, force_N=-force, displacement_mm=-w))
     assert test.turned == ("force", "displacement")
     same(plain, test)
@@ -207,39 +205,6 @@ def test_the_other_channels_agree_with_force_and_motion(tmp_path: Path) -> None:
         assert not any(note.startswith("Check: the displacement is used") for note in test.notes)
 
 
-@pytest.mark.parametrize("measure", ["true strain", "Green strain"])
-def test_a_strain_of_another_measure_is_reversed_before_it_is_converted(
-    tmp_path: Path, measure: str
-) -> None:
-    w = path_through([0, 5, 0])
-    strain = -np.log(1 - w / 10) if measure == "true strain" else 0.5 * (1 - (1 - w / 10) ** 2)
-    columns: dict[str, Any] = {"time (s)": 0.01 * np.arange(len(w)), "force (N)": foam(w)}
-    test = read_test(written(tmp_path, **columns, **{measure: -strain}))
-    assert test.turned == ("strain",)
-    np.testing.assert_allclose(test.displacement, 1e-3 * w, atol=1e-9)
-
-
-def test_a_motion_with_its_own_clock(tmp_path: Path) -> None:
-    t, force, _ = impact(rest=True)
-    at = np.arange(-0.8, 3.8, 0.02)
-    w = np.interp(at, t, impact(rest=True)[2])
-    motion = '[motion]\nfile = "camera.csv"\n'
-    written(tmp_path, name="camera", time_ms=at, displacement_mm=w)
-    path = written(tmp_path, SPECIMEN + STRIKER + motion, time_ms=t, force_N=force)
-    plain = read_test(path)
-    written(tmp_path, name="camera", time_ms=at, displacement_mm=20.0 - w)
-    test = read_test(path)
-    assert (plain.turned, test.turned) == ((), ("displacement",))
-    assert any(
-        "camera.csv: The displacement 'displacement_mm' counts down" in n for n in test.notes
-    )
-    written(tmp_path, name="camera", time_ms=at, displacement_mm=w)
-    entry = 'displacement = { column = "displacement_mm", counts_down = true }\n'
-    toml = SPECIMEN + STRIKER + motion + "[motion.columns]\n" + entry
-    path.with_suffix(".toml").write_text(toml)
-    refused(path, "leave counts_down = true out in [motion.columns]")
-
-
 # ---------------------------------------------------------------------- what is refused
 
 
@@ -281,7 +246,7 @@ def test_every_output_says_what_was_reversed(tmp_path: Path) -> None:
     path = written(
         tmp_path, time_s=0.01 * np.arange(len(w)), force_N=-foam(w), Gap_um=9e3 - 1e3 * w
     )
-    told = " ".join(CliRunner().invoke(main, ["check", str(path)]).stdout.split())
+    told = " ".join(run("check", str(path)).stdout.split())
     notes = (
         "The force 'force_N' is negative in compression; its sign is reversed.",
         "The displacement 'Gap_um' counts down in compression; its sign is reversed.",
@@ -298,7 +263,7 @@ def test_every_output_says_what_was_reversed(tmp_path: Path) -> None:
 # ---------------------------------------------------------------------- measured records
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are not here")
+@needs_data
 @pytest.mark.parametrize(
     ("name", "size", "turned"),
     [
@@ -314,25 +279,10 @@ def test_every_output_says_what_was_reversed(tmp_path: Path) -> None:
 def test_measured_records_need_no_entry_for_their_sign(
     tmp_path: Path, name: str, size: tuple[float, float], turned: tuple[str, ...]
 ) -> None:
-    toml = tmp_path / "test.toml"
-    toml.write_text('[specimen]\nheight = "{} mm"\ndiameter = "{} mm"\n'.format(*size))
-    test = read_test(DATA / name, toml)
+    test = read_test(DATA / name, specimen_toml(tmp_path, *size))
     assert test.turned == turned
     strain, peak = test.displacement / test.specimen.height, test.stress.max()
     assert 0.4 < strain.max() < 0.8
     assert test.stress.min() > -0.1 * peak
     up = strain[: np.argmax(strain) + 1] > 0.5 * strain.max()
     assert (test.stress[: up.size][up] > 0.1 * peak).all()
-
-
-@pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are not here")
-def test_the_first_evaluation_of_the_aluminium_foam(tmp_path: Path) -> None:
-    """Its last five rows jump to -99 MPa; the second evaluation does not (H. Yao 2026)."""
-    toml = tmp_path / "test.toml"
-    toml.write_text('[specimen]\nheight = "15 mm"\ndiameter = "30 mm"\n')
-    test = read_test(DATA / "aluminium-foam" / "stress_strain_rate.csv", toml)
-    assert "stress from 'engineering_stress_MPa', strain from 'engineering_strain'" in test.notes[0]
-    assert test.stress.max() == pytest.approx(16.8e6, rel=0.01)
-    (item,) = [item for item in test.rows.dropped if "the stress jumps there" in item.why]
-    assert (item.rows, item.first, item.last) == (5, 998, 1002)
-    assert not any("-99" in note or "-98" in note for note in test.notes)

@@ -90,40 +90,6 @@ def test_every_quantity_keeps_its_own_and_check_shows_it(tmp_path):
         assert part in told
 
 
-@pytest.mark.parametrize(
-    ("area", "sigma"),
-    [
-        ('area = "20 ± 0.5 mm^2"', 0.5e-6),
-        ('area = "20 mm^2 ± 1 %"\ndiameter = "5.046 ± 1 mm"', 0.2e-6),
-        ('area = "20 mm^2"\ndiameter = "5.046 mm ± 1 %"', 0.4e-6),
-    ],
-)
-def test_the_area_goes_before_the_diameter(tmp_path, area, sigma):
-    test = read_test(written(tmp_path, specimen(area=area)))
-    assert test.specimen.area == pytest.approx(20e-6)
-    assert test.uncertainties == {"area": pytest.approx(sigma, rel=1e-3)}
-
-
-def test_only_what_is_read_has_a_scale(tmp_path):
-    """A force named in the TOML replaces the stress, unless the TOML names both.
-
-    An acceleration replaces a missing stress, with its scale.
-    """
-    motion = {"time (s)": TIME, "displacement (mm)": 4.0 * LOOP}
-    columns = motion | {"stress (MPa)": 2.0 * LOOP, "load cell": LOOP}
-    force = '[columns]\nforce = { column = "load cell", unit = "N", scale = "200 ± 1" }\n'
-    test = read_test(written(tmp_path, specimen() + force, **columns))
-    assert test.uncertainties == {"stress_scale": pytest.approx(0.005)}
-    both = force + 'stress = { column = "stress (MPa)" }\n'
-    assert read_test(written(tmp_path, specimen() + both, **columns)).uncertainties == {}
-    columns = motion | {"accelerometer": 2.0 * LOOP}
-    entry = 'acceleration = { column = "accelerometer", unit = "V", scale = "9 m/s^2/V ± 2 %" }'
-    striker = '[striker]\nmass = "1 kg"\n'
-    toml = specimen() + striker + f"[columns]\n{entry}\n"
-    test = read_test(written(tmp_path, toml, **columns))
-    assert test.uncertainties == {"stress_scale": pytest.approx(0.02)}
-
-
 BAD = [
     ("10 ± -1 mm", "must not be negative"),
     ("10 ± 10 mm", "must be less than the value"),

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 
-from conftest import EXPERIMENTS
-
-sys.path.insert(0, str(EXPERIMENTS / "microscale"))
 import microscale
 
 

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import math
-import sys
 
 import pytest
 
-import foamfit as ff
-from conftest import EXPERIMENTS
-
-sys.path.insert(0, str(EXPERIMENTS / "paper_claims"))
 import claims
+import foamfit as ff
 from claims import FOAM_2, MODEL_1, MODEL_2, MODEL_3, OWN_MASS, STRIKER
 
 

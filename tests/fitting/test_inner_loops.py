@@ -9,7 +9,6 @@ import pytest
 
 import foamfit as ff
 from conftest import loop_measurement
-from foamfit.data.cycles import inner_loops
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.report.summary import summary_text
 
@@ -29,21 +28,6 @@ def record(corners: tuple[float, ...] = CORNERS, between: int = 60) -> Measureme
     return replace(made, noise=Noise(stress=SIGMA))
 
 
-@pytest.mark.parametrize(
-    ("corners", "loops"),
-    [
-        (CORNERS, [(60, 143), (240, 321)]),
-        ((0.0, 0.6, 0.0), []),
-        ((0.0, 0.5, 0.2, 0.4, 0.3, 0.6, 0.0), [(60, 280)]),  # a loop within a loop
-        ((0.0, 0.6, 0.3, 0.5), [(120, 181)]),  # the record ends within its inner loop
-    ],
-)
-def test_partial_unloading_lasts_until_the_motion_is_past_it(
-    corners: tuple[float, ...], loops: list[tuple[int, int]]
-) -> None:
-    assert inner_loops(record(corners).displacement) == loops
-
-
 def test_microscale_springs_follow_inner_loops_to_the_noise() -> None:
     test = record()
     micro = ff.fit(test, model="microscale", starts=4, intervals="local")
@@ -53,14 +37,6 @@ def test_microscale_springs_follow_inner_loops_to_the_noise() -> None:
     assert not any("inner loops" in note for note in micro.notes)
     (visited,) = (check for check in micro.checklist if check.key == "visited")
     assert (visited.answer, visited.sentence) == (True, "a, snap-through and snap-back were.")
-
-
-def test_snap_back_that_was_not_reached_is_told() -> None:
-    up = record((0.0, 0.6))
-    fit = ff.fit(up, model="microscale", starts=2, intervals="local")
-    (visited,) = (check for check in fit.checklist if check.key == "visited")
-    assert (visited.answer, visited.sentence) == (False, "Not visited: snap-back of s1.")
-    assert fit.parameters["s1_sigma_minus"].why == "branch snap-back of spring 1 was never reached"
 
 
 def test_a_bistable_fit_says_what_partial_unloading_leaves() -> None:

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import AREA, EXPERIMENTS, HEIGHT, loop_measurement, synthetic_impact
+import rig
+from conftest import AREA, HEIGHT, loop_measurement, synthetic_impact
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.curves import default_weights
-from foamfit.fitting.minima import in_order
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import fix_and_vary, make_params
-from foamfit.fitting.search import Tracker
 from foamfit.one_model import Options
 from foamfit.springs.model import Model
-from foamfit.trust.settle import keep_to_record
-
-sys.path.insert(0, str(EXPERIMENTS / "recovery"))
-import rig
 
 SPRING = ff.MicroscaleSpring(
     k0=5.5e5, kc=4e5, eps_star=0.3, sigma_plus=1.1e5, spread_plus=0.4, sigma_minus=7e4,
@@ -44,17 +38,6 @@ def test_held_unknowns_are_refused_by_name_where_they_cannot_be(fixed, why):
     params = fix_and_vary(make_params(test), "bistable", fixed, [])
     with pytest.raises(ff.InputError, match=why):
         ff.fit(test, params=params)
-
-
-def test_what_is_exact_varies_where_that_is_asked_for():
-    test = synthetic_impact()[1]
-    params = fix_and_vary(make_params(test), "bistable", {"displacement_zero": 0.0}, ["velocity"])
-    found = ff.fit(test, params=params, starts=2, intervals="local")
-    zero = found.params["displacement_zero"]
-    assert (zero.value, zero.vary) == (0.0, False)
-    assert "displacement_zero" not in found.parameters  # a zero fixed at 0 is omitted
-    item = found.parameters["velocity"]
-    assert abs(item.value - 2.0) < 3 * item.stderr < 0.05
 
 
 def in_blocks(test: Measurement, size: int) -> Measurement:
@@ -156,19 +139,6 @@ def test_residuals_of_a_driven_loop_are_weighed_by_their_full_covariance(driven)
     np.testing.assert_array_equal(one.jacobian(values, np.arange(7)), weighing(slopes))
 
 
-@pytest.mark.parametrize("held", [False, True])
-def test_relaxation_terms_come_back_in_the_order_of_their_times(driven, held):
-    """A term with a fixed parameter keeps its place instead."""
-    params = make_params(driven.measurement, "microscale", relaxation=2)
-    params["s1_g1"].set(vary=not held)
-    problem = Options(relaxation=2).problem(driven.measurement, "microscale", params)
-    terms = [problem.index[f"s1_{short}"] for short in ("g1", "tau1", "g2", "tau2")]
-    values = problem.vector()
-    values[terms] = 0.1, 1.0, 0.2, 0.05
-    found = in_order(problem.space(), problem.objective, values)[terms]
-    assert found.tolist() == ([0.1, 1.0, 0.2, 0.05] if held else [0.2, 0.05, 0.1, 1.0])
-
-
 @pytest.mark.parametrize("terms", [0, 2])
 @pytest.mark.parametrize("mullins", [False, True])
 def test_the_derivative_by_the_zero_of_a_driving_motion_is_that_of_differences(terms, mullins):
@@ -197,27 +167,6 @@ def test_the_derivative_by_the_zero_of_a_driving_motion_is_that_of_differences(t
     found, wanted = slopes["stress_strain"][1], (sides[1] - sides[0]) / (2.0 * step)
     assert (strain < 0.07).any()
     assert np.linalg.norm(found - wanted) < 1e-3 * np.linalg.norm(wanted)
-
-
-def test_a_minimum_that_the_search_missed_is_no_error_of_the_law(tmp_path):
-    """With contact and zeros held, the descents reach it; then they are free again."""
-    record = rig.impact(rig.Impact(law="microscale", samples=400, before=0.3), 2)
-    test = ff.read_test(rig.write(record, tmp_path))
-    problem = Options(drive="impact").problem(test, "microscale", None)
-    right = problem.vector()
-    for name, value in record.truth.items():
-        if name.startswith("s1_"):
-            right[problem.index[name]] = value
-    wrong = right.copy()
-    wrong[problem.index["s1_k0"]] *= 3.0
-    tracker = Tracker(problem.objective)
-    tracker.consider(wrong)
-    tracker.ends = [right]
-    found, freed = keep_to_record(problem, tracker, ())
-    assert freed is None
-    assert not found.kept
-    assert "contact_time" in found.free()
-    assert tracker.best_cost < 1.1 * found.objective.n_data
 
 
 def test_a_steep_branch_is_weighed_by_the_noise_of_the_motion(tmp_path):

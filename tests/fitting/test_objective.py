@@ -9,13 +9,13 @@ import pytest
 
 import foamfit as ff
 from conftest import synthetic_impact, synthetic_loop
-from foamfit.data.measurement import Measurement, Noise, Outliers, Striker
+from foamfit.data.measurement import Measurement, Noise, Outliers
 from foamfit.fitting.curves import (
     check_drive,
     choose_drive,
     default_weights,
 )
-from foamfit.fitting.objective import PENALTY, Objective
+from foamfit.fitting.objective import Objective
 from foamfit.one_model import Options
 from foamfit.springs.model import Model
 
@@ -43,25 +43,6 @@ def test_the_true_parameters_leave_nothing_without_noise():
     assert np.max(np.abs(usual.residual(known(usual, values_of(spring))))) < 1e-3
 
 
-def test_estimated_noise_is_the_scale_as_long_as_it_is_not_tiny():
-    spring, measurement = synthetic_impact()
-    plain = objective(replace(measurement, noise=Noise()))
-    assert plain.scale["stress_time"] == pytest.approx(measurement.noise.stress, rel=0.15)
-    assert plain.scale["displacement_time"] == pytest.approx(
-        measurement.noise.displacement, rel=0.15
-    )
-    assert np.std(plain.residual(known(plain, values_of(spring)))) == pytest.approx(1.0, abs=0.15)
-
-
-def test_a_weight_multiplies_squares():
-    spring, measurement = synthetic_impact()
-    plain = objective(measurement, weights={"stress_time": 1.0})
-    values = known(plain, values_of(spring))
-    one = plain.residual(values)
-    four = objective(measurement, weights={"stress_time": 4.0}).residual(values)
-    assert four @ four == pytest.approx(4 * (one @ one), rel=1e-12)
-
-
 def test_each_channel_is_counted_once():
     _, impact = synthetic_impact()
     assert objective(impact).counted == ("stress_time", "displacement_time")
@@ -86,19 +67,6 @@ def test_a_motion_integrated_from_the_force_has_no_misfit_unless_it_is_counted()
     other = objective(integrated, "displacement")
     simulated = other.simulate(known(other, values_of(spring)))
     assert other.misfit(simulated)["stress_strain"] > 0.0
-
-
-def test_failures_cost_a_finite_penalty_and_are_counted():
-    spring, measurement = synthetic_impact()
-    plain = objective(replace(measurement, noise=Noise()))
-    bad = known(plain, values_of(spring))
-    bad[2] = 1.0  # dsigma > 0
-    assert np.all(plain.residual(bad) == plain.penalty)
-    for name in plain.counted:  # at least ten times the range of every curve
-        assert plain.penalty >= PENALTY * np.ptp(plain.measured[name]) / plain.scale[name]
-    assert (plain.evaluations, plain.failures) == (1, 1)
-    worst = plain.residual(known(plain, values_of(spring)))
-    assert np.max(np.abs(worst)) < plain.penalty
 
 
 def test_the_stress_strain_misfit_runs_along_the_measured_displacement():
@@ -229,68 +197,6 @@ def test_nuisance_parameters_of_an_impact_act_as_their_names_say(shown, eta):
     wanted = differences_of(one, values, np.append(np.ones(9), steps))[:, 9:]
     off = np.sort(np.abs(found - wanted), axis=0)[-5]
     assert np.all(off <= 2e-3 * np.sort(np.abs(wanted), axis=0)[-5])
-
-
-def followed_chain(drive, noise=None):
-    """Return the true parameters of two springs and a test in which the mass inside was tracked."""
-    spring, loop = synthetic_loop()
-    stiff = replace(spring, k0=9e6, eps_a=0.16)
-    height, area = loop.specimen.height, loop.specimen.area
-    chain = ff.Chain([stiff, spring], [0.5 * height] * 2, area)
-    if drive == "impact":
-        time = np.linspace(0.0, 0.6e-3, 301)
-        response = ff.simulate(chain, ff.Impact(7e-3, 2.0), time)
-    else:
-        time = np.arange(loop.displacement.size, dtype=float)
-        response = ff.simulate(chain, ff.DisplacementDrive(loop.displacement), time)
-    measurement = replace(
-        loop,
-        time=time if drive == "impact" else None,
-        stress=response.base_stress,
-        displacement=response.displacement[-1],
-        striker=Striker(7e-3, 2.0) if drive == "impact" else None,
-        noise=noise or Noise(),
-        interior={1: response.displacement[0] + 3e-6},
-    )
-    heights = [0.5 * height] * 2
-    values = np.array([*stiff.seven, 0.0, *spring.seven, 0.0, *heights, 0.0])
-    return values, measurement
-
-
-TWO = Model.parse("bistable+bistable")
-
-
-@pytest.mark.parametrize(
-    ("drive", "counted"),
-    [
-        ("impact", ("stress_time", "displacement_time", "displacement_1_time")),
-        ("displacement", ("stress_strain", "displacement_1_time")),
-        ("stress", ("displacement_time", "displacement_1_time")),
-    ],
-)
-def test_a_mass_inside_counts_in_every_drive(drive, counted):
-    values, measurement = followed_chain(drive)
-    one = Objective(measurement, TWO, drive, default_weights(measurement, drive, 2))
-    assert one.counted == counted
-    values = known(one, values)
-    off = one.residual(values)[-one.sizes[-1] :]  # 3 µm was added to the measured motion
-    expected = -3e-6 / one.scale["displacement_1_time"]
-    if drive == "stress":  # the simulated motion is smoothed
-        assert np.median(off) == pytest.approx(expected, rel=0.1)
-    else:
-        np.testing.assert_allclose(off, expected, rtol=1e-3)
-    misfit = one.misfit(one.simulate(values))
-    in_ranges = off * one.scale["displacement_1_time"] / np.ptp(measurement.interior[1])
-    assert misfit["displacement_1_time"] == pytest.approx(np.sqrt(np.mean(in_ranges**2)), rel=1e-12)
-
-
-def test_a_single_spring_has_nothing_inside():
-    _, measurement = followed_chain("displacement")
-    one = objective(measurement, "displacement")
-    assert one.counted == ("stress_strain",)
-    assert "displacement_1_time" not in one.weights
-    with pytest.raises(ff.InputError, match="displacement_1_time"):
-        objective(measurement, "displacement", {"displacement_1_time": 1.0})
 
 
 def test_the_drive_is_chosen_by_what_the_test_has():

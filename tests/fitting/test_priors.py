@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import foamfit as ff
-from conftest import synthetic_impact
+from conftest import synthetic_impact, write_measurement
 
 OPTIONS = {"model": "bistable", "starts": 2, "intervals": "local"}
 
@@ -61,21 +61,15 @@ def test_priors_belong_to_one_model(impact: ff.Measurement) -> None:
 
 
 def test_the_toml_may_have_priors(impact: ff.Measurement, tmp_path: Path) -> None:
-    rows = zip(impact.time, impact.stress, impact.displacement, strict=True)
-    lines = ["time (s),stress (Pa),displacement (m)", *(f"{t},{s},{u}" for t, s, u in rows)]
-    toml = (
-        '[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n'
-        '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n[priors]\ns1_k0 = '
-    )
     for name in ("a", "b"):
-        (tmp_path / f"{name}.csv").write_text("\n".join(lines))
-        (tmp_path / f"{name}.toml").write_text(toml + '"4 ± 0.001 MPa"\n')
+        prior = '[priors]\ns1_k0 = "4 ± 0.001 MPa"\n'
+        path = write_measurement(tmp_path / f"{name}.csv", impact, prior)
     result = ff.fit(ff.read_test(tmp_path / "a.csv"), **OPTIONS)
     assert result.parameters["s1_k0"].value == pytest.approx(4e6, rel=2e-3)
     study = tmp_path / "study.toml"
     study.write_text('name = "x"\ntests = ["*.csv"]\nmodel = "bistable"\n')
     with pytest.raises(ff.InputError, match=r"a joint fit accepts no \[priors\]"):
         ff.joint(study, jobs=1)
-    (tmp_path / "a.toml").write_text(toml + "4e6\n")
+    write_measurement(path, impact, "[priors]\ns1_k0 = 4e6\n")
     with pytest.raises(ff.InputError, match=r"\[priors\] s1_k0 = 4000000.0 must be like "):
-        ff.read_test(tmp_path / "a.csv")
+        ff.read_test(path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import lmfit
@@ -10,23 +9,20 @@ import numpy as np
 import pytest
 
 import foamfit as ff
+import rig
 from conftest import (
     DATA,
     EXPERIMENTS,
     loop_measurement,
     needs_data,
+    specimen_toml,
     synthetic_impact,
     synthetic_loop,
     thinned,
 )
-from foamfit.data.measurement import Noise, Specimen
+from foamfit.data.measurement import Specimen
 from foamfit.fitting import levenberg
-from foamfit.fitting.minima import in_order
 from foamfit.fitting.problem import make_params
-from foamfit.one_model import Options
-
-sys.path.insert(0, str(EXPERIMENTS / "recovery"))
-import rig
 
 NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 
@@ -116,13 +112,6 @@ def test_contact_and_zero_are_reported_in_the_numbers_of_the_file():
     assert result.parameters["contact_time"].state == "fixed"
 
 
-@pytest.mark.parametrize(("model", "max_time"), [("bistable", 0.02), ("bistable+bistable", 1e-6)])
-def test_the_best_point_survives_the_time_limit(model, max_time):
-    result = ff.fit(synthetic_impact()[1], model=model, max_time=max_time)
-    assert "time limit" in result.warnings[0]
-    assert np.isfinite(result.misfit["stress_time"])
-
-
 def test_the_best_point_survives_ctrl_c(monkeypatch):
     _, measurement = synthetic_impact()
     calls = 0
@@ -140,26 +129,6 @@ def test_the_best_point_survives_ctrl_c(monkeypatch):
     assert "Ctrl-C" in result.warnings[0]
     assert result.stopped == "Ctrl-C"
     assert result.misfit["stress_time"] < 0.05
-
-
-def test_a_test_that_no_spring_can_follow_fails_honestly():
-    _, measurement = synthetic_loop()
-    rng = np.random.default_rng(0)
-    noise = np.abs(rng.standard_normal(measurement.stress.size)) * 1e6
-    result = ff.fit(replace(measurement, stress=noise), starts=4)
-    assert result.status == "failed"
-    assert any("not acceptable" in warning for warning in result.warnings)
-
-
-def test_without_stated_noise_the_errors_come_from_the_residuals():
-    _, measurement = synthetic_impact()
-    stated, guessed = (
-        ff.fit(test, starts=4, intervals="local")
-        for test in (measurement, replace(measurement, noise=Noise()))
-    )
-    for name in ("s1_kc", "s1_eps_c", "s1_kh_plus"):
-        ratio = guessed.parameters[name].stderr / stated.parameters[name].stderr
-        assert 0.7 < ratio < 1.4, name
 
 
 @pytest.mark.parametrize(
@@ -229,21 +198,6 @@ def test_a_mass_inside_shows_which_spring_is_at_the_base():
     assert result.weights["displacement_1_time"] == 1.0
 
 
-def test_without_a_mass_inside_the_softest_spring_is_put_at_the_base():
-    """The motion of a mass inside determines the order; `test_series` has a full fit without."""
-    followed = two_springs(STIFF, SOFT)
-    blind = replace(followed, interior={})
-    for measurement, springs in ((blind, (SOFT, STIFF)), (followed, (STIFF, SOFT))):
-        problem = Options().problem(measurement, "bistable+bistable")
-        stiff_first, wanted = problem.vector(), problem.vector()
-        for values, there in ((stiff_first, (STIFF, SOFT)), (wanted, springs)):
-            for number, spring in enumerate(there, start=1):
-                first = problem.index[f"s{number}_k0"]
-                values[first : first + 7] = spring.seven
-        found = in_order(problem.space(), problem.objective, stiff_first)
-        np.testing.assert_array_equal(found, wanted)
-
-
 def test_where_no_motion_is_measured_another_contact_time_is_tried(tmp_path):
     """A minimum with later contact and a dashpot has χ² = 1801, the true parameters 1795."""
     record = rig.impact(rig.Impact(channels=("force", "acceleration")), 6010)
@@ -281,10 +235,10 @@ def test_a_mass_inside_is_left_out_of_a_single_spring_and_refused_as_the_top():
         ff.fit(top, model="linear+bistable")
 
 
-FOAMS = {
-    "turbo-comp-1": (7.63, 10.53),
-    "leap-comp-2": (7.62, 10.65),
-    "new-heel-comp-1": (7.67, 9.90),
+FOAMS = {  # height and diameter, mm
+    "turbo-comp-1": (10.53, 7.63),
+    "leap-comp-2": (10.65, 7.62),
+    "new-heel-comp-1": (9.90, 7.67),
 }
 
 
@@ -292,11 +246,8 @@ FOAMS = {
 @pytest.mark.parametrize("name", FOAMS)
 def test_one_spring_follows_the_first_cycle_of_a_shoe_foam(name, tmp_path):
     """Data of arXiv:2602.12694; an exhaustive global search reaches misfits of 0.029 to 0.032."""
-    diameter, height = FOAMS[name]
-    toml = tmp_path / "foam.toml"
-    toml.write_text(f'[specimen]\nheight = "{height} mm"\ndiameter = "{diameter} mm"\n')
     record = thinned(DATA / "shoe-foam" / f"{name}_cycle1.csv", tmp_path, 4)
-    measurement = ff.read_test(record, toml)
+    measurement = ff.read_test(record, specimen_toml(tmp_path, *FOAMS[name]))
     result = ff.fit(measurement, intervals="local")
     assert result.drive == "displacement"
     assert result.misfit["stress_strain"] <= 0.035

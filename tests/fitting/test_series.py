@@ -1,4 +1,4 @@
-"""Two springs in series: starts read off a loop, exchanges between springs, other minima."""
+"""Two springs in series: exchanges between springs, and intervals that hold the truth."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import pytest
 import foamfit as ff
 from conftest import loop_measurement
 from foamfit.data.measurement import Specimen
-from foamfit.springs.loop import Loop
 from foamfit.springs.model import Model, exchanges
 
 SOFT = ff.BistableSpring(2.0e6, 9e7, -9e4, 0.055, 0.22, 6e5, 1.1e5)
@@ -22,16 +21,6 @@ def common_loop():
     time = np.linspace(0.0, 4.0, motion.size)
     found = ff.simulate(chain, ff.DisplacementDrive(motion), time)
     return motion, time, found.base_stress
-
-
-def test_the_kinks_of_a_loop_are_the_stresses_at_which_its_springs_snap():
-    motion, _, stress = common_loop()
-    at_a1, at_c1, at_c2, at_a2 = Loop(motion / 0.01, stress).kinks
-    for spring in (SOFT, STIFF):
-        for kinks, snap in ((at_a1, spring.sigma_a), (at_c2, spring.sigma_c)):
-            assert np.min(np.abs(kinks[:, 1] / snap - 1.0)) < 0.05
-    assert len(at_c1)
-    assert len(at_a2)
 
 
 @pytest.mark.parametrize("law", ["bistable", "microscale"])
@@ -64,18 +53,13 @@ def test_an_exchange_keeps_the_stresses_at_which_springs_snap(law):
         assert stiffnesses(vector) == pytest.approx(stiffnesses(values))
 
 
-def test_springs_of_different_laws_exchange_nothing():
-    model = Model.parse("bistable+microscale")
-    assert not list(exchanges(model, np.ones(len(model.names))))
-
-
 def test_intervals_of_two_springs_hold_the_truth():
     """With 0.2 % noise, at least 85 % of the intervals contain the true value."""
     motion, time, stress = common_loop()
     rng = np.random.default_rng(3)
     noisy = stress + 0.002 * np.ptp(stress) * rng.standard_normal(stress.size)
     test = loop_measurement(noisy, motion, Specimen(0.01, 4.5e-5, heights=(0.005, 0.005)), time)
-    result = ff.fit(test, model="bistable+bistable", drive="displacement", starts=24)
+    result = ff.fit(test, model="bistable+bistable", drive="displacement", starts=12)
     base, top = result.chain.springs
     assert base.sigma_a < 0.7 * top.sigma_a
     assert result.curves.interior == {}

@@ -10,7 +10,7 @@ from conftest import HEIGHT, synthetic_loop
 from foamfit.errors import InputError
 from foamfit.fitting import together as engine
 from foamfit.fitting.levenberg import Iterate
-from foamfit.fitting.links import KINDS, LOG_RATE, POWER_RATE, Links, law_values, start_of
+from foamfit.fitting.links import KINDS, LOG_RATE, POWER_RATE, Links, law_values
 from foamfit.fitting.problem import make_problem
 from foamfit.fitting.together import fit_linked
 
@@ -76,18 +76,6 @@ def test_shared_parameters_have_one_value_and_own_ones_their_own(tests):
             for p, values in zip(problems, found.values, strict=True)
         )
     )
-
-
-def test_nothing_shared_is_each_test_alone(tests):
-    problems, starts = tests
-    names = problems[0].free()
-    together = fit_together(problems, names, [starts])
-    alone = [fit_together([p], (), [[start]]) for p, start in zip(problems, starts, strict=True)]
-    for cost, one in zip(together.costs, alone, strict=True):
-        assert cost == pytest.approx(one.cost, rel=1e-4)
-    # sharing more parameters never lowers the cost
-    costs = [fit_together(problems, names[:n], [starts]).cost for n in (0, 3)]
-    assert costs[0] > costs[1] >= together.cost * (1.0 - 1e-6)
 
 
 def test_a_shared_parameter_stays_one_value_where_its_limit_is_another_for_each_test():
@@ -189,10 +177,3 @@ def test_a_scattering_parameter_is_drawn_to_what_the_tests_have_in_common():
     assert spreads[0] > spreads[1] > 100 * spreads[2]
     (common,) = drawn.common["s1_kh_plus"]
     assert np.log(common) == pytest.approx(np.mean(np.log(drawn.value("s1_kh_plus"))), abs=1e-5)
-
-
-def test_values_that_a_law_cannot_meet_start_at_their_median():
-    assert start_of(LOG_RATE, 2.0 * (1.0 + 0.1 * X), X) == pytest.approx((2.0, 0.1))
-    assert start_of(POWER_RATE, 2.0 * np.exp(0.1 * X), X) == pytest.approx((2.0, 0.1))
-    assert start_of(LOG_RATE, np.array([9.0, 1.0, 0.0]), X) == (1.0, 0.0)
-    assert start_of(POWER_RATE, np.array([1.0, 2.0]), np.zeros(2)) == (1.5, 0.0)

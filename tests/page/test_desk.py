@@ -13,14 +13,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import foamfit as ff
-from conftest import EXPERIMENTS, few_bytes, synthetic_impact, synthetic_loop, without_pictures
+from conftest import EXPERIMENTS, few_bytes, run, without_pictures
 from cycled import write_record
-from foamfit.cli import main
-from foamfit.data.cycles import cycles_of
-from foamfit.data.measurement import Measurement, Specimen
 from foamfit.errors import InputError
 from foamfit.page import desk as desk_module
 from foamfit.page import worker as worker_module
@@ -31,8 +27,6 @@ from foamfit.report.folder import load_result
 from foamfit.report.studies import cycles as cycles_report
 
 TEST = EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv"
-NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
-HEADERS = ["time (ms)", "force (N)", "displacement (mm)"]
 GOOD = {
     "[specimen] height": "1.19 mm", "[specimen] diameter": "5 mm",
     "[striker] mass": "7 g", "[striker] velocity": "2 m/s",
@@ -141,18 +135,6 @@ def test_a_table_and_a_toml_that_arrive_together_belong_together(desk, order, mo
     assert desk.replaced
 
 
-def test_two_desks_share_nothing(tmp_path):
-    one, two = Desk(tmp_path / "one"), Desk(tmp_path / "two")
-    one.take(TEST)
-    quantities, rest = one.dropped_toml()
-    assert two.dropped_toml() is None
-    with pytest.raises(InputError, match="no test yet"):
-        two.check(quantities, rest)
-    one.check(quantities, rest)
-    two.close()
-    one.check(quantities, rest)
-
-
 # -------------------------------------------------------------------------------------- TOML
 
 
@@ -201,18 +183,6 @@ def test_a_wrong_quantity_is_named(desk, quantity, value, told):
 
 
 @pytest.mark.usefixtures("without_process")
-def test_a_fit_is_that_of_the_command(ready):
-    worker = ready.fit(["--starts", "2", "--seed", "3"])
-    assert worker.ended == ""
-    measurement = ff.read_test(TEST)
-    there = ff.fit(measurement, model="bistable", starts=2, seed=3)
-    saved = load_result(ready.result)["parameters"]["s1_k0"]["value"]
-    assert saved == there.params["s1_k0"].value
-    # The last progress message must agree with the result.
-    assert worker.news.misfit["stress_time"] == pytest.approx(there.misfit["stress_time"], rel=0.02)
-
-
-@pytest.mark.usefixtures("without_process")
 def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path):
     record = write_record(tmp_path)
     desk.take(record)
@@ -223,7 +193,7 @@ def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path):
     assert desk.ending() == ""
     assert desk.command == f"foamfit fit synthetic.csv {' '.join(asked)}"
     assert "2 of 3 cycles fitted" in desk.worker.told
-    told = CliRunner().invoke(main, ["fit", str(record), *asked, "--json", f"--out={tmp_path}/r"])
+    told = run("fit", str(record), *asked, "--json", f"--out={tmp_path}/r")
     command = json.loads(told.stdout)["cycles"]
     assert sorted(desk.fits) == [2, 3]
     for number, folder in desk.fits.items():
@@ -235,40 +205,6 @@ def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path):
         assert desk.measured(number, None).cycle == number
     with zipfile.ZipFile(io.BytesIO(desk.zipped())) as archive:
         assert {"cycles.csv", "cycles.png", "cycle-3/fit.json"} <= {*archive.namelist()}
-
-
-@pytest.mark.usefixtures("without_process")
-def test_several_cycles_are_one_history(desk, tmp_path):
-    desk.take(write_record(tmp_path))
-    quantities, rest = desk.dropped_toml()
-    desk.check(quantities, rest, ["--cycles", "1-3"])
-    record = desk.measurement
-    assert (record.cycle, record.last_cycle) == (1, 3)
-    assert desk.measured(1, 3) is record
-    assert desk.measured(2, 3).last_cycle == 3
-    desk.fit(["--cycles", "1-3", "--starts", "2", "--max-time", "2"])
-    assert desk.ending() == ""
-    assert (desk.worker.news.cycle, desk.worker.news.last_cycle) == (1, 3)
-    assert [*desk.fits] == [0]
-    for wrong, told in (
-        (["--cycles", "3-1"], "'3-1' is not FIRST-LAST in that order, like 1-3"),
-        (["--cycles", "1-9"], "the file has cycles 1 to 3"),
-        (["--cycles", "1-3", "--cycle", "2"], "give either --cycle or --cycles, not both"),
-    ):
-        with pytest.raises(InputError, match=told) as refused:
-            desk.check(quantities, rest, wrong)
-        assert "\n" not in str(refused.value)
-
-
-def test_watching_a_fit_changes_nothing():
-    measurement, seen = ff.read_test(TEST), []
-    plain = ff.fit(measurement, starts=2, intervals="local")
-    watched = ff.fit(
-        measurement, starts=2, intervals="local", watch=lambda problem, at: seen.append(at)
-    )
-    assert plain.params.valuesdict() == watched.params.valuesdict()
-    assert plain.statistics["nfev"] == watched.statistics["nfev"]
-    assert len(seen) > 10
 
 
 def test_a_fit_that_is_stopped_keeps_the_best(ready):
@@ -372,79 +308,6 @@ def test_turned_curves_are_those_of_a_simulation(drive):
     along = response.strain if drive == "impact" else measurement.displacement / 1.19e-3
     np.testing.assert_allclose(strain, along, rtol=0.0, atol=1e-5)
     assert not np.allclose(stress, before.curves["stress_strain"][1], atol=1e-2 * size)
-
-
-def test_a_history_is_drawn_as_a_whole_with_what_springs_remember(tmp_path):
-    record = ff.read_test(write_record(tmp_path), cycles=(1, 3))
-    turning = Turning(record, "microscale", stiffening=True, mullins=True)
-    names = {row.name for row in turning.rows}
-    assert {"s1_stiffening", "s1_softening", "s1_weakening"} <= names
-    drawn = turning.turn({"s1_softening": 0.4, "s1_weakening": 0.3})
-    for curves in (turning.measured, drawn.curves):
-        strain, stress = curves["stress_strain"]
-        np.testing.assert_array_equal(strain, record.displacement / record.specimen.height)
-        assert len(stress) == len(record.stress)
-    # During loading, the second cycle is softer than the first.
-    loading = [part.start + (part.stop - part.start) // 4 for part in cycles_of(record).values()]
-    stresses = np.interp(loading, np.arange(len(stress)), drawn.curves["stress_strain"][1])
-    assert stresses[1] < 0.95 * stresses[0]
-
-
-def test_what_is_not_admissible_is_named():
-    turning = Turning(ff.read_test(TEST), "bistable")
-    before = turning.named["s1_eps_c"]
-    drawn = turning.turn({"s1_eps_c": 0.01})
-    assert "eps_c = 0.01 is not admissible" in drawn.error
-    assert drawn.curves == {}
-    assert not turning.turn({"s1_eps_c": before}).error
-
-
-def test_sliders_reach_around_the_values_and_stay_admissible():
-    values = {"s1_k0": 5.5e6, "s1_eps_a": 0.14, "s1_eps_c": 0.31, "s1_dsigma": -2e5}
-    for row in Turning(ff.read_test(TEST), "bistable", values=values).rows:
-        assert row.least <= row.low <= row.value <= row.high <= row.most
-        assert row.high > row.low
-        if row.name in values:
-            assert row.value * row.factor == pytest.approx(values[row.name])
-
-
-def test_the_heights_of_a_chain_keep_their_sum():
-    turning = Turning(ff.read_test(TEST), "linear+bistable")
-    turning.turn({"s1_height": 0.4e-3})
-    assert turning.named["s1_height"] == 0.4e-3
-    assert turning.named["s2_height"] == pytest.approx(0.79e-3)
-
-
-@pytest.mark.parametrize("make", [synthetic_impact, synthetic_loop])
-def test_sliders_begin_near_the_loop_but_at_no_fit(make):
-    _, measurement = make()
-    off = Turning(measurement, "bistable").turn({}).misfit["stress_strain"]
-    assert 0.01 < off < 0.30  # a fit reaches the noise, 0.005
-
-
-def test_points_lie_on_the_branches_they_join():
-    spring = ff.published["foam-1/model-1"].bistable
-    values = {f"s1_{name}": getattr(spring, name) for name in NAMES}
-    found = Turning(synthetic_loop()[1], "bistable", values).turn({}).points
-    assert set(found) == {"A1", "C1", "C2", "A2"}
-    hat_c = found["C1"][0]
-    along = spring.stress([found["A1"][0], hat_c, hat_c + 1e-9, found["C2"][0], found["A2"][0]])
-    expected = [found[name][1] for name in ("A1", "C1", "C2", "A2")]
-    np.testing.assert_allclose(along[[0, 1, 3, 4]], expected, rtol=1e-6, atol=1.0)
-
-
-def test_points_leave_out_a2_where_the_branches_do_not_meet():
-    spring = ff.BistableSpring(1e6, 50e6, -5e4, 0.3, 0.6, 2e6, 1e9)
-    assert spring.eps_hat_a is None
-    values = {f"s1_{name}": getattr(spring, name) for name in NAMES}
-    found = Turning(synthetic_loop()[1], "bistable", values).turn({}).points
-    assert set(found) == {"A1", "C1", "C2"}
-
-
-def test_a_test_without_stress_and_motion_is_refused():
-    bare = Measurement("bare", None, "", None, np.zeros(3), None, Specimen(1e-3, 1e-5))
-    with pytest.raises(InputError, match="bare"):
-        Turning(bare, "bistable")
 
 
 # ------------------------------------------------------------- fixed and varied parameters

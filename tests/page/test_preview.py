@@ -69,7 +69,7 @@ def test_a_fit_offers_its_card_and_the_plan_of_the_next_test(tmp_path):
 
     desk = Fitted(tmp_path / "window")
     test = ff.read_test(EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv")
-    ff.fit(test).save(tmp_path / "fit", report=False)
+    ff.fit(test, starts=2, intervals="local").save(tmp_path / "fit", report=False)
     names = zipfile.ZipFile(io.BytesIO(desk.card(0))).namelist()
     assert {"foam.k", "foam.k.json"} <= set(names)
     assert b"which test next?" in desk.planned(0)

@@ -5,9 +5,8 @@ import socket
 import sys
 
 import pytest
-from click.testing import CliRunner
 
-from foamfit.cli import main
+from conftest import run_refused
 from serving import served
 
 pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
@@ -102,20 +101,10 @@ def test_a_path_leads_to_no_file(served):
 
 def test_a_missing_extra_says_which_line_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "panel", None)
-    found = CliRunner().invoke(main, ["page"])
-    assert found.exit_code == 1
-    assert 'pip install "foamfit[page]"' in found.stderr
-    assert len(found.stderr.splitlines()) == 1
+    assert 'pip install "foamfit[page]"' in run_refused("page")
 
 
-def test_a_test_that_is_not_there_is_refused(tmp_path):
-    found = CliRunner().invoke(main, ["page", str(tmp_path / "none.csv")])
-    assert found.exit_code == 1
-    assert "no such file" in found.stderr
-
-
-def test_a_port_that_is_taken_is_refused(served):
-    found = CliRunner().invoke(main, ["page", "--no-browser", "--port", str(served.port)])
-    assert found.exit_code == 1
-    assert f"--port {served.port} cannot be used" in found.stderr
-    assert len(found.stderr.splitlines()) == 1
+def test_a_wrong_call_is_refused(served, tmp_path):
+    assert "no such file" in run_refused("page", tmp_path / "none.csv")
+    told = run_refused("page", "--no-browser", "--port", served.port)
+    assert f"--port {served.port} cannot be used" in told

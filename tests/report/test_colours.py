@@ -7,14 +7,12 @@ CIE76 distances in L*a*b* (D65).
 
 from __future__ import annotations
 
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from drawn import figures
 from foamfit.report.figures import BLUE, FITTED, SEEN
 
 EYES = {
@@ -59,36 +57,6 @@ def is_told(one: Any, other: Any) -> dict[str, float]:
         eye: round(far, 1) for eye, far in found.items()
         if far < (APART_IN_GREY if eye == "grey" else APART)
     }  # fmt: skip
-
-
-def cue(line: Any) -> tuple[Any, ...]:
-    """Return the features of a line other than colour: marker, dashes and width."""
-    width = line.get_linewidth()
-    dashes = str(line._unscaled_dash_pattern) if line.get_linestyle() != "None" else ""
-    marked = line.get_marker() not in ("None", None, "")
-    hollow = marked and line.get_markerfacecolor() == "white"
-    return (
-        line.get_marker(),
-        hollow,
-        dashes,
-        0 if marked else int(width >= 1.4) + int(width >= 2.5),
-    )
-
-
-def test_series_of_a_panel_are_told_apart_by_colour_or_shape() -> None:
-    compared = 0
-    for name, figure in figures():
-        for ax in figure.axes:
-            lines = {str(line.get_label()): line for line in ax.lines}
-            shown = [k for k in lines if not (k.startswith("_child") or "all samples" in k)]
-            named = {k: lines[k] for k in shown}
-            for (k, one), (m, other) in combinations(named.items(), 2):
-                by_name = one.get_marker() == "o" or k.startswith("_branch")
-                if cue(one) == cue(other) and not (by_name and k.startswith("_")):
-                    compared += 1
-                    told = is_told(one.get_color(), other.get_color())
-                    assert not told, (name, k, m, told)
-    assert compared >= 3
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 import fabricated
-import foamfit as ff
 import foamfit.report.figures
 import foamfit.report.folder
 import foamfit.report.summary
 from conftest import small_pictures
 from foamfit.errors import InputError
-from foamfit.report.folder import check_target, load_result
+from foamfit.report.folder import load_result
 
 FILES = {
     "fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf", "table.tex",
@@ -122,16 +121,6 @@ def test_masses_inside_have_their_columns(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_an_older_result_is_replaced_whole(tmp_path: Path) -> None:
-    folder = fabricated.result().save(tmp_path / "r")
-    (folder / "profiles.csv").write_text("of a fit that had profiles")
-    fabricated.result(seed=8).save(folder)
-    assert {path.name for path in folder.iterdir()} == FILES
-    assert load_result(folder)["seed"] == 8
-    assert [path.name for path in tmp_path.iterdir()] == ["r"]
-
-
-@pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
 def test_failing_midway_leaves_the_older_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: type[BaseException]
@@ -149,16 +138,6 @@ def test_failing_midway_leaves_the_older_result(
     assert load_result(folder)["seed"] == 1
     assert {path.name for path in folder.iterdir()} == FILES
     assert [path.name for path in tmp_path.iterdir()] == ["r"]
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_folder_of_something_else_is_refused_and_kept(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("all of it")
-    with pytest.raises(InputError, match="not empty"):
-        fabricated.result().save(tmp_path)
-    with pytest.raises(InputError, match="is a file"):
-        check_target(tmp_path / "thesis.tex")
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
 @pytest.mark.parametrize(
@@ -192,17 +171,3 @@ def test_derived_numbers_of_a_microscale_spring() -> None:
     assert derived["p_max_strain"] == pytest.approx(0.6)
     on_a, on_c = 1.06e5 / (4.4e5 + 1.06e5), 0.29 + 1.06e5 / (4.9e5 + 1.06e5)
     assert derived["snap_strain"] == pytest.approx(on_c - on_a)
-
-
-def test_snapping_in_a_chain_is_told_where_the_stress_tells_it() -> None:
-    one = fabricated.microscale_result()
-    still = replace(fabricated.MICRO, relaxation=())
-    linear = ff.LinearSpring(k0=6e6)
-    heights = [0.5 * fabricated.HEIGHT] * 2
-    for top, known in ((still, True), (fabricated.MICRO, False), (replace(still, eta=9.0), False)):
-        chain = ff.Chain([linear, top], heights, fabricated.AREA)
-        result = fabricated.microscale_result(model="linear+microscale", chain=chain)
-        assert set(result.snapping) == ({"s2"} if known else set())
-        assert set(replace(result, drive="impact").snapping) == set()
-        if known:
-            assert result.snapping["s2"].most == pytest.approx(one.snapping["s1"].most)

@@ -16,11 +16,9 @@ from itertools import zip_longest
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
 import fabricated
-from conftest import ROOT
-from foamfit.cli import main
+from conftest import ROOT, run
 from foamfit.data.measurement import Dropped, RowCount
 from foamfit.parts import Ladder, Rung
 from foamfit.report.comparison import compare, comparison_text
@@ -33,7 +31,7 @@ TEST = "experiments/foam-1/model-1-1.75mps-reconstruction.csv"
 
 
 def printed(*args: object) -> str:
-    done = CliRunner().invoke(main, [str(arg) for arg in args])
+    done = run(*args)
     assert done.exit_code == 0, done.output
     return done.stdout
 
@@ -149,14 +147,6 @@ def test_what_is_printed_is_the_golden_file(name: str, monkeypatch: pytest.Monke
     expected = path.read_text(encoding="utf-8").splitlines()
     for i, (was, now) in enumerate(zip_longest(expected, text.splitlines()), start=1):
         assert now == was, f"line {i} of {path.name} differs; {RENEW}=1 writes the files anew"
-
-
-def test_what_has_no_room_on_the_screen_is_in_the_verbose_text() -> None:
-    short, whole = (summary_text(two_bistable(), verbose=verbose) for verbose in (False, True))
-    assert "95 % interval" not in short
-    for name in ("s1_k0", "s2_eta", "contact time t₀"):
-        assert name in short
-        assert re.search(rf"{name} .* to .* determined", whole)
 
 
 def test_every_golden_file_is_of_a_case() -> None:

@@ -2,10 +2,7 @@
 
 import json
 
-from click.testing import CliRunner
-
-from conftest import without_pictures
-from foamfit.cli import main
+from conftest import run, without_pictures
 
 TIMES = [0.01 * i for i in range(241)]  # s
 HEAD = "time (s),force (MN),strain (%),displacement (mm)\n"
@@ -22,7 +19,7 @@ def test_what_check_finds_wrong_stands_before_all_other_warnings(tmp_path, monke
         '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n[noise]\nstress = "1 Pa"\n'
     )
     call = ["fit", str(tmp_path / "test.csv"), "--model", "linear", "--drive", "displacement"]
-    out = CliRunner().invoke(main, [*call, "--starts", "2", "--out", str(tmp_path / "out")])
+    out = run(*call, "--starts", "2", "--out", str(tmp_path / "out"))
     assert out.exit_code in (0, 2), out.output
     fit = json.loads((tmp_path / "out" / "fit.json").read_text())
     asked = [text.startswith("Check:") for text in fit["warnings"]]

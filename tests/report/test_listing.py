@@ -4,10 +4,8 @@ import json
 import re
 
 import pytest
-from click.testing import CliRunner
 
-from conftest import ROOT
-from foamfit.cli import main
+from conftest import ROOT, run, run_refused
 from foamfit.errors import InputError
 from foamfit.report.listing import results_in, write_index
 
@@ -31,7 +29,7 @@ def folder(tmp_path):
 
 
 def test_every_result_is_one_line(folder):
-    ran = CliRunner().invoke(main, ["list", str(folder)])
+    ran = run("list", str(folder))
     assert ran.exit_code == 0
     head, *lines = ran.output.split("\n\n")[0].splitlines()
     assert head.split() == ["test", "model", "status", "options", "misfit", "determined", "when"]
@@ -72,6 +70,4 @@ def test_a_result_folder_itself_stays_as_it_is(folder):
 
 def test_a_folder_without_results_is_refused(tmp_path):
     for name in ("missing", "."):
-        ran = CliRunner().invoke(main, ["list", str(tmp_path / name)])
-        assert ran.exit_code == 1
-        assert "foamfit fit TEST.csv writes" in ran.output
+        assert "foamfit fit TEST.csv writes" in run_refused("list", tmp_path / name)

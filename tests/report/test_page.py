@@ -107,26 +107,6 @@ def test_the_page_says_what_was_found() -> None:
         assert said in words
 
 
-def test_masses_inside_are_in_the_table_of_misfits() -> None:
-    result = fabricated.result()
-    inside = 0.4 * result.curves.displacement
-    changed = {
-        "curves": replace(result.curves, interior={1: (inside, inside)}),
-        "misfit": result.misfit | {"displacement_1_time": 0.021},
-    }
-    assert "displacement-time of mass 1 2.1 %" in page(**changed).words
-    summary = summary_text(fabricated.result(**changed))
-    assert "displacement-time of mass 1 2.1 %" in " ".join(summary.split())
-    assert "mass 1" not in summary_text(result)
-
-
-def test_branches_are_told_per_spring() -> None:
-    words = page(visited={"s1": ("a", "d")}).words
-    assert "d · snap-buckling c · densified, not reached e · snap-back, not reached" in words
-    whole = Page(render_report(fabricated.chain_result(), fabricated.no_figures())).words
-    assert "s1 linear, has no branches s2 a · elastic" in whole
-
-
 @pytest.mark.parametrize(
     ("value", "stderr", "unit", "expected"),
     [
@@ -169,16 +149,3 @@ def test_many_parameters_and_warnings_are_still_one_screen(long: str) -> None:
     assert {name for name in one if f"\n{name} " in text} == {*one} - {"s2_eta", "s2_kh_minus"}
     assert "\nwarning: 0 word word" in text
     assert re.search(r"\nand \d more warnings: see the report, or --verbose\n", text)
-
-
-def test_what_a_microscale_spring_snapped_and_relaxes_is_told() -> None:
-    words = Page(render_report(fabricated.microscale_result(), fabricated.no_figures())).words
-    for said in (
-        "96 % of the micro-springs snap in this test, at 230.8 kPa and a strain of 0.6000",
-        "changes 1.500 times as much as in equilibrium and then relaxes: 33 % of it",
-        "68 % snap through at 68.27 to 164.6 kPa 106.0 kPa",
-        "relaxes, with τ = 250.0 ms 0.3333",
-        "s1_tau1 τ 1,1 250.0 ± 3.0 ms",
-    ):
-        assert said in words
-    assert "not reached" not in words

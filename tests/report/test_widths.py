@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import fabricated
+from conftest import run_refused
 from drawn import figures
-from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.report.figures import DPI, STYLE, inches
-from foamfit.report.plots import plot_fit
 
 
 @pytest.mark.parametrize(
@@ -39,28 +36,8 @@ def test_what_is_no_width_is_refused_before_anything_is_done(
 ) -> None:
     with pytest.raises(InputError, match=words):
         fabricated.result().save(tmp_path / "r", figure_width=width)
-    told = CliRunner().invoke(main, ["fit", "none.csv", "--figure-width", width])
-    assert told.exit_code == 1
-    assert words in told.stderr
-    assert told.stderr.count("\n") == 1
+    assert words in run_refused("fit", "none.csv", "--figure-width", width)
     assert not list(tmp_path.iterdir())
-
-
-def test_panels_stand_above_each_other_in_one_column_and_letters_keep_their_size() -> None:
-    narrow, wide = (plot_fit(fabricated.result(), width=width) for width in ("one", "two"))
-    assert (narrow.get_figwidth(), wide.get_figwidth()) == (3.25, 7.0)
-    assert narrow.get_figheight() < 9.0  # fits on a page
-    narrow.draw_without_rendering()
-    boxes = [ax.get_position() for ax in narrow.axes[:3]]
-    assert [round(box.x0, 3) for box in boxes] == [round(boxes[0].x0, 3)] * 3
-    assert boxes[0].y0 > boxes[1].y1 > boxes[1].y0 > boxes[2].y1
-
-    def sizes(figure: Any) -> list[float]:
-        return [text.get_fontsize() for ax in figure.axes for text in ax.get_xticklabels()][:3] + [
-            ax.xaxis.label.get_fontsize() for ax in figure.axes
-        ]
-
-    assert sizes(narrow) == sizes(wide)
 
 
 @pytest.mark.parametrize("width", ["one", "two"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -11,9 +10,6 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import EXPERIMENTS
-
-sys.path.insert(0, str(EXPERIMENTS / "stability"))
 import independent
 from independent import follow, over_range
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import EXPERIMENTS
-from foamfit.solve.plan import plan
-from foamfit.springs.chain import Chain, Impact
-
-sys.path.insert(0, str(EXPERIMENTS / "recovery"))
 import rig
 import rigs
+from foamfit.solve.plan import plan
+from foamfit.springs.chain import Chain, Impact
 
 WEIGHT = 300.0  # m/s²: thirty times standard gravity, so that every test would show its absence
 

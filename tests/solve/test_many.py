@@ -138,40 +138,6 @@ def test_like_springs_switch_together_and_nearly_like_ones_one_by_one() -> None:
         )
 
 
-@pytest.mark.parametrize(
-    "time",
-    [[0.1e-3], [-1e-3, -0.5e-3], [0.0, 1e-7], [-1e-4, 0.0, 0.3e-3], [0.0, 5e-3], [2e-3, 3e-3]],
-)
-def test_samples_before_within_and_after_contact(time: list[float]) -> None:
-    chain, at = built(chain_of(10)), np.array(time)
-    got, want = ff.simulate(chain, ff.Impact(STRIKER, 2.1), at), one_by_one(chain, 2.1, at)
-    assert np.allclose(got.displacement, want.displacement, rtol=1e-9, atol=1e-15)
-    assert np.allclose(got.base_stress, want.base_stress, rtol=1e-9, atol=1e-3)
-    assert len(got.switches) == len(want.switches)
-    assert (got.contact_end is None) == (want.contact_end is None)
-
-
-def test_only_what_one_stress_tells_of_is_taken_as_one() -> None:
-    chain, blow = chain_of(10), ff.Impact(STRIKER, 1.75)
-
-    def method(*others: Bistable | Linear, masses: tuple[float, ...] | None = None) -> str:
-        springs = (*chain.springs[: 10 - len(others)], *others)
-        scene = dataclasses.replace(chain, springs=springs, masses=masses)
-        return ff.simulate(built(scene), blow, TIME[:60]).method
-
-    assert method() == method(Linear(60e6)) == AGGREGATE
-    assert method(masses=(*[0.0] * 9, 1e-3)) == AGGREGATE
-    assert method(dataclasses.replace(MODEL_1, eta=10.0)) == EXPLICIT_STEPS
-    assert method(Linear(60e6, unilateral=True)) == EXPLICIT_STEPS
-    assert method(dataclasses.replace(MODEL_1, kh_plus=0.0)) == EXPLICIT_STEPS
-    assert method(dataclasses.replace(MODEL_1, kh_minus=0.0)) == EXPLICIT_STEPS
-    assert method(masses=(*[0.0] * 4, 1e-3, *[0.0] * 5)) == EXPLICIT_STEPS
-    carried = ff.simulate(built(chain), blow, TIME, sensitivities=["s1_k0"])
-    assert carried.method == EXPLICIT_STEPS
-    few = Chain(chain.springs[:8], chain.heights[:8], AREA)
-    assert ff.simulate(built(few), blow, TIME).method == EXPLICIT_STEPS
-
-
 # ---------------------------------------------------------------- a prescribed elongation
 
 # Reversals on every branch, tension, and strains past all switches.

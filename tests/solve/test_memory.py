@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import EXPERIMENTS
 from foamfit.springs.chain import Drive
 from foamfit.springs.spring import Spring
-
-sys.path.insert(0, str(EXPERIMENTS / "stability"))
 from independent import Array, follow
 
 AREA = 1.9635e-5

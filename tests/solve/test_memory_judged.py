@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import EXPERIMENTS
-
-sys.path.insert(0, str(EXPERIMENTS / "stability"))
 import fresh
 from independent import Truth, follow, over_range
 
@@ -44,9 +40,6 @@ def alone(law: tuple[float, ...], **more: Any) -> ff.Chain:
     return ff.Chain([ff.MicroscaleSpring(*law, **more)], [H], AREA)
 
 
-# ------------------------------------------------------------------------------------- the judge
-
-
 # ----------------------------------------------------------------------------------- closed forms
 
 
@@ -67,17 +60,6 @@ def test_an_impact_keeps_what_the_loop_takes(law: tuple[float, ...], soft: float
         assert answer.contact_end == pytest.approx(truth.contact_end, rel=rtol)
         flown = np.diff(answer.displacement[-1, -2:])[0]
         assert flown == pytest.approx(want, rel=3.0 * rtol)
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_the_stress_comes_back_to_where_it_turned(law: tuple[float, ...]) -> None:
-    """Inner loops between two visits of a strain have no effect."""
-    time = np.arange(9.0)
-    strain = (0.6 + law[2]) * np.array([0.0, 0.7, 0.2, 0.5, 0.3, 0.5, 0.2, 0.7, 0.75])
-    bare = alone(law)
-    chain = ff.Chain([ff.LinearSpring(4e6), *bare.springs], [H / 10, H], AREA)
-    stepped = ff.simulate(chain, ff.DisplacementDrive(H * strain), time, rtol=1e-9).base_stress
-    assert stepped[[5, 6, 7]] == pytest.approx(stepped[[3, 2, 1]], rel=1e-8)
 
 
 @pytest.mark.parametrize("law", LAWS)

@@ -13,12 +13,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 
 import fabricated
-from conftest import EXPERIMENTS, without_pictures
+from conftest import EXPERIMENTS, run, without_pictures
 from foamfit import api
-from foamfit.cli import main
 from foamfit.solve import cache, precompile
 from foamfit.solve.compiled import loop
 from foamfit.springs.compiled import bistable
@@ -105,7 +103,7 @@ def test_the_first_use_says_that_it_compiles(
     for ready in (False, True):
         monkeypatch.setattr(cache, "compiled", lambda *_, ready=ready: ready)
         out = str(tmp_path / f"{ready}")
-        told = CliRunner().invoke(main, ["fit", str(RECONSTRUCTION), "--out", out])
+        told = run("fit", RECONSTRUCTION, "--out", out)
         assert told.exit_code == 0, told.output
         assert ("compiling the solver" in told.stderr) == (not ready)
     assert asked == [("integrate", "bistable"), ("follow", "bistable")]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import sys
 from dataclasses import replace
 from typing import Any
 
@@ -15,9 +14,6 @@ from scipy.optimize import brentq
 from scipy.special import ndtri
 
 import foamfit as ff
-from conftest import EXPERIMENTS
-
-sys.path.insert(0, str(EXPERIMENTS / "stability"))
 from independent import follow
 
 Terms = list[tuple[float, float]]
@@ -159,44 +155,6 @@ def test_moments_of_short_and_long_steps_meet() -> None:
 
 
 # ------------------------------------------------------------------------ prescribed stress
-
-
-def test_springs_in_series_under_a_stress() -> None:
-    springs = [
-        ff.MicroscaleSpring(*SHOE),
-        ff.LinearSpring(6e6),
-        ff.BistableSpring(2e5, 4e6, -1e4, 0.2, 0.5, 2e5, 1.2e5),
-    ]
-    heights = [1e-2, 2e-3, 5e-3]
-    stress = loops((0.0, 1.9e5, 3e4, 1.5e5, 2e4, 3e5, 0.0), 12)
-    t = np.linspace(0.0, 1.0, stress.size)
-    names = [
-        "s1_sigma_minus", "s1_spread_plus", "s1_height", "s2_k0", "s3_kh_plus", "s3_height",
-    ]  # fmt: skip
-
-    def run(springs: list[Any], heights: list[float], **more: Any) -> ff.Response:
-        return ff.simulate(ff.Chain(springs, heights, 1e-4), ff.StressDrive(stress), t, **more)
-
-    got = run(springs, heights, sensitivities=names)
-    strains = [spring.strain(stress) for spring in springs]
-    want = np.cumsum([h * e for h, e in zip(heights, strains, strict=True)], axis=0)
-    np.testing.assert_allclose(got.displacement, want, rtol=1e-14, atol=1e-18)
-    np.testing.assert_array_equal(got.base_stress, stress)
-    for name in names:
-        i, short = int(name[1]) - 1, name[3:]
-        ends = []
-        for factor in (1 - 1e-6, 1 + 1e-6):
-            one, h = list(springs), list(heights)
-            if short == "height":
-                h[i] *= factor
-            else:
-                one[i] = replace(one[i], **{short: getattr(one[i], short) * factor})
-            ends.append(run(one, h).displacement)
-        size = 2e-6 * (heights[i] if short == "height" else getattr(springs[i], short))
-        by = got.sensitivities[name]
-        rough = (ends[1] - ends[0]) / size
-        assert np.abs(by.displacement - rough).max() <= 1e-6 * np.abs(rough).max(), name
-        assert not by.base_stress.any()
 
 
 def test_what_a_spring_cannot_bear_is_refused() -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from foamfit.fitting.problem import make_problem
 from foamfit.solve.plan import Motion, plan
 from foamfit.springs.chain import Drive
 from foamfit.springs.spring import Spring
@@ -195,34 +194,3 @@ def test_a_name_that_is_no_parameter_is_refused() -> None:
     for name in ("s2_k0", "kc", "s1_kx", "s1_kc ", ""):
         with pytest.raises(ValueError, match="is not a parameter of this chain"):
             ff.simulate(chain([BISTABLE]), IMPACT, TIME, sensitivities=[name])
-
-
-@pytest.mark.parametrize("model", ["bistable", "linear+bistable"])
-@pytest.mark.parametrize("drive", ["impact", "displacement", "stress"])
-def test_the_jacobian_of_a_fit_against_differences(model: str, drive: str) -> None:
-    """In SI and in search coordinates, where the last height follows from the others."""
-    test = ff.read_test("experiments/foam-1/model-3-2.0mps-reconstruction.csv")
-    problem = make_problem(test, model, drive, None, None, interior_mass=False)
-    problem.objective.rtol = 1e-12
-    space = problem.space()
-    rng = np.random.default_rng(3)
-    point = space.encode(problem.vector()) + 0.02 * rng.random(len(space.coordinates))
-    values = space.decode(point)
-    residual = problem.objective.residual
-    names = problem.free()
-    exact = problem.slopes(values, names)
-    for column, name in enumerate(names):
-        step = 1e-6 * problem.sizes((name,), values)[0]
-        high, low = values.copy(), values.copy()
-        high[problem.index[name]] += step
-        low[problem.index[name]] -= step
-        differences = (residual(space.complete(high)) - residual(space.complete(low))) / (2 * step)
-        miss = np.linalg.norm(exact[:, column] - differences)
-        assert miss <= 2e-2 * np.linalg.norm(differences) + 1e-9 / step, name
-    along = problem.objective.jacobian_along(values, space.slopes(point, values))
-    for column in range(point.size):
-        move = np.zeros(point.size)
-        move[column] = 1e-6
-        differences = residual(space.decode(point + move)) - residual(space.decode(point - move))
-        miss = np.linalg.norm(along[:, column] - differences / 2e-6)
-        assert miss <= 2e-2 * np.linalg.norm(differences) / 2e-6 + 1e-3, space.coordinates[column]

@@ -62,9 +62,6 @@ def struck(name: str, eta: float = 0.0, mass: float = 0.0) -> tuple[Chain, ff.Im
     return Chain(springs, heights, AREA, (mass, 0.0)), ff.Impact(blow.mass, blow.velocity)
 
 
-# --------------------------------------------------------------------------------------- the method
-
-
 # -------------------------------------------------------------------- against other solvers
 
 
@@ -96,7 +93,8 @@ def test_against_reference(name: str, drive: str, rtol: float, bar: float) -> No
     got = run(CHAINS[name], load, rtol)
     assert max(errors(got, want)) <= bar
     assert got.method == RADAU
-    assert len(got.switches) >= want.switches
+    usual = ff.simulate(built(CHAINS[name]), load, TIME, rtol=rtol)
+    assert len(got.switches) >= len(usual.switches)
     if want.contact_end is not None:
         assert got.contact_end == pytest.approx(want.contact_end, rel=bar)
     assert got.steps < 3000
@@ -113,28 +111,6 @@ def test_dashpots_like_explicit_steps(name: str, eta: float, rtol: float, bar: f
     # with heavy dashpots the striker separates so slowly that explicit steps are no more accurate
     assert got.contact_end == pytest.approx(want.contact_end, rel=bar if eta < 1e6 else 1e-4)
     assert got.steps < 1000
-
-
-@pytest.mark.parametrize("name", PAIRS)
-@pytest.mark.parametrize("mass", [5.56e-6, 1e-6])
-def test_vibrations_like_explicit_steps(name: str, mass: float) -> None:
-    scene = struck(name, mass=mass)
-    want = run(*scene, 1e-11, implicit=False)
-    got = run(*scene, 1e-6)
-    assert max(errors(got, want)) <= 1e-6
-    assert got.steps < 2000
-
-
-def test_flat_branches_like_explicit_steps() -> None:
-    flat = Bistable(2e6, 60e6, -0.3e6, 0.35, 0.66, 0.0, 0.0)
-    for chain in (
-        Chain((flat,), (1e-3,), AREA),
-        Chain((BASE_3, flat), THREE, AREA),
-        Chain((damped(BASE_3, 100.0), flat), THREE, AREA),
-        Chain((damped(BASE_3, 100.0), damped(flat, 10.0)), THREE, AREA),
-    ):
-        want = run(chain, ff.Impact(7e-3, 1.75), 1e-11, implicit=False)
-        assert max(errors(run(chain, ff.Impact(7e-3, 1.75), 1e-8), want)) <= 1e-8
 
 
 def test_flat_branch_under_stress_is_refused() -> None:
@@ -224,34 +200,6 @@ def test_contact_with_heavy_dashpots_ends_as_in_closed_form(eta: float) -> None:
         assert got.steps < 400
 
 
-@pytest.mark.parametrize("name", PAIRS)
-def test_heavy_dashpots(name: str) -> None:
-    chain, blow = struck(name, 1e8)
-    want = run(chain, blow, 1e-11, implicit=False)
-    got = run(chain, blow, 1e-9, implicit=None)
-    assert got.method == RADAU
-    assert got.steps < 1000
-    assert max(errors(got, want)) <= 1e-8
-    # the dashpots stop the striker before the spring forces matter
-    stopping = blow.mass / AREA * sum(chain.heights) / 1e8
-    assert got.displacement[-1].max() == pytest.approx(blow.velocity * stopping, rel=1e-4)
-
-
-@pytest.mark.parametrize("eta", [1e-6, 1e-2, 1.0])
-def test_prescribed_motion_of_light_dashpots(eta: float) -> None:
-    chain = Chain((damped(BASE_3, eta), damped(TOP_3, eta)), THREE, AREA)
-    still = Chain((BASE_3, TOP_3), THREE, AREA)
-    load = ff.DisplacementDrive(3.6e-4 * history())
-    got = run(chain, load, 1e-8, implicit=None)
-    limit = run(still, load, 1e-8)  # in closed form
-    assert got.method == RADAU
-    assert got.steps < 2000
-    assert max(errors(got, limit)) <= 1e-9 + 1e-3 * eta
-    if eta == 1.0:
-        assert max(errors(got, run(chain, load, 1e-11, implicit=False))) <= 1e-10
-    np.testing.assert_allclose(got.displacement[-1], load.displacement, rtol=0, atol=1e-18)
-
-
 # ------------------------------------------------------------------------------------- the choice
 
 
@@ -274,13 +222,6 @@ def test_the_choice() -> None:
         assert got.method == RADAU
         assert got.steps < 1000
         assert got.solver == "second order"
-
-
-def test_explicit_steps_that_fail_are_taken_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("foamfit.solve.plan.MOST_RELAXATION", np.inf)
-    chain, blow = struck("foam-2", 1e-2)
-    scene = plan(built(chain), blow, TIME)._replace(max_explicit=100)
-    assert run_plan(scene, chain, 1e-6).method == RADAU
 
 
 def test_the_bound_on_steps() -> None:

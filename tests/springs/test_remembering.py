@@ -253,21 +253,6 @@ def test_inner_loops_return_to_where_they_began(name: str, by_strain: bool) -> N
     assert out[12] == pytest.approx(follow(stress[[0, 12]])[1], rel=1e-12)
 
 
-def test_zero_stress_does_not_wipe_out_what_has_snapped_once() -> None:
-    """The second loop of a test differs from the first; the third equals the second."""
-    up = np.linspace(0.0, 2.5e6, 40)
-    loop = np.concatenate([up, up[::-1]])
-    strain = WORN.strain(np.tile(loop, 3)).reshape(3, -1)
-    p, ever = WORN.fractions_along(np.tile(loop, 3))
-    assert p[[0, 79, 80, 159]].tolist() == [0.0] * 4
-    assert (ever[39:] == ever[39]).all()
-    assert (strain[1, 1:39] > strain[0, 1:39] + 1e-4).all()
-    assert strain[2] == pytest.approx(strain[1], rel=1e-14)
-    assert strain[:, 39] == pytest.approx([strain[0, 39]] * 3, rel=1e-14)  # the peak
-    # unloading is the same as in the first loop
-    assert strain[1, 40:] == pytest.approx(strain[0, 40:], rel=1e-14)
-
-
 # ------------------------------------------------------------------------------------- derivatives
 
 

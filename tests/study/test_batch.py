@@ -18,19 +18,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 
 import fabricated
 import foamfit as ff
-from conftest import HEIGHT, synthetic_impact, without_pictures, write_csv
-from foamfit.cli import main
+from conftest import HEIGHT, run, run_refused, synthetic_impact, write_csv
 from foamfit.cli import many as command
-from foamfit.report.studies import batch as batch_report
 from foamfit.report.studies.batch import Row, row_of, write_comparison, write_page
 from foamfit.study import batch as module
 from foamfit.study import batch_work
 from foamfit.study.batch_work import work
-from foamfit.study.processes import ATTEMPTS, EndedError, Processes
 from foamfit.terminal import TerminatedError
 from inline import Inline
 
@@ -79,10 +75,6 @@ def again(**changed):
     return ff.batch("tests", **(given | changed))
 
 
-def run(*words):
-    return CliRunner().invoke(main, [str(word) for word in words])
-
-
 def names(folder):
     return sorted(path.name for path in Path(folder).iterdir())
 
@@ -125,31 +117,6 @@ def test_the_same_numbers_with_any_number_of_processes_and_anywhere(here):
     parts = [f"s1_k0{part}" for part in ("", "_stderr", "_lo", "_hi", "_state")]
     assert head[8:13] == parts
     pd.testing.assert_frame_equal(frame, pd.read_csv("two/summary.csv"), check_dtype=False)
-
-
-@pytest.fixture
-def undrawn(monkeypatch):
-    """Replace the figures of the tests and of their comparison by a few bytes."""
-    without_pictures(monkeypatch)
-    monkeypatch.setattr(batch_report, "plot_parameters", lambda *_, **__: None)
-    monkeypatch.setattr(batch_report, "write_both", lambda *_: b"<svg/>")
-
-
-def test_figures_of_another_width_are_made_again_where_there_are_any(here, tried, undrawn):
-    again(report=False)
-    again(report=True, figure_width="two")  # the reports are missing
-    assert len(tried) == 6
-    assert {"report.html", "fit.png", "fit.pdf"} <= set(names("out/a"))
-    assert 'href="a/report.html"' in Path("out/summary.html").read_text()
-    tried.clear()
-    again(report=True, figure_width="177.8 mm")  # two columns
-    again(report=False)
-    assert tried == []
-    again(report=True, figure_width="one")
-    again(report=True, figure_width="3.25 in")
-    assert len(tried) == 3
-    with pytest.raises(ff.InputError, match="the width of figures = 'narrow'"):
-        again(report=True, figure_width="narrow")
 
 
 def test_a_cycle_is_a_row_and_its_folder_is_in_that_of_the_test(here, monkeypatch):
@@ -200,15 +167,6 @@ def test_only_what_is_missing_or_has_changed_is_fitted(here, tried):
         assert sorted(tried) == (["a", "b", "c", "d"] if wanted is None else wanted)
 
 
-def test_a_test_that_became_unreadable_loses_its_old_result(here, tried):
-    again()
-    (here / "tests/a.csv").write_text("nothing")
-    assert again().set_index("test").loc["a", "status"] == "refused"
-    assert names("out/a") == ["batch.json"]
-    write(here / "tests", "a", 0)
-    assert again().set_index("test").loc["a", "status"] != "refused"
-
-
 # ------------------------------------------------------------------------- failures
 
 
@@ -254,39 +212,6 @@ def test_a_test_that_kills_its_process_is_a_row_and_is_tried_again_when_called(
     assert {name: after[name] for name in before} == before
 
 
-# Kills its process at the first call; built without any import in that process.
-SEEN_ONCE = """
-import os, pathlib, signal
-seen = pathlib.Path({path!r})
-if not seen.exists():
-    seen.touch()
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def test_one_process_that_ends_takes_nothing_else_with_it(tmp_path, monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    with Processes(2) as pool:
-        calls = [pool.submit(time.sleep, 0.05) for _ in range(6)]
-        twice = pool.submit(os._exit, 1)
-        once = pool.submit(exec, SEEN_ONCE.format(path=str(tmp_path / "seen")))
-        threads = pool.submit(os.getenv, "OMP_NUM_THREADS")
-        assert [call.result() for call in calls] == [None] * 6
-        assert once.result() is None
-        assert (tmp_path / "seen").exists()
-        assert threads.result() == "1"
-        with pytest.raises(EndedError, match=f"ended {ATTEMPTS} times"):
-            twice.result()
-    pool = Processes(1)
-    sleeping = pool.submit(time.sleep, 60)
-    while not sleeping.running():
-        time.sleep(0.01)
-    began = time.monotonic()
-    pool.stop()
-    assert time.monotonic() - began < 10
-    assert sleeping.exception() is not None or sleeping.cancelled()
-
-
 def shown(out):
     """Return the tests and their states from the page of a batch."""
     page = (Path(out) / "summary.html").read_text(encoding="utf-8")
@@ -325,6 +250,18 @@ def test_a_full_disk_ends_in_one_sentence_and_loses_nothing(here, tried, monkeyp
     assert tried == ["b", "c"]
 
 
+def test_memory_errors_and_other_versions_are_not_the_fault_of_a_test(here, monkeypatch):
+    monkeypatch.setattr(batch_work, "fit", lambda *_, **__: (_ for _ in ()).throw(MemoryError()))
+    frame = again().set_index("test")
+    assert "its fit was lost (MemoryError" in frame.loc["a", "error"]
+    assert names("out") == [
+        "bad",
+        "summary.csv",
+        "summary.html",
+        "summary.tex",
+    ]  # no result of the test, so the next call retries it
+
+
 def test_an_executor_that_ends_is_one_sentence_and_what_is_done_stays(here, tried):
     class Ending(Inline):
         count = 0
@@ -338,18 +275,6 @@ def test_an_executor_that_ends_is_one_sentence_and_what_is_done_stays(here, trie
     with pytest.raises(ff.InputError, match=r"executor has ended.*1 of 4 tests are done"):
         again(executor=Ending())
     assert list(numbers("out")) == ["a"]
-
-
-def test_memory_errors_and_other_versions_are_not_the_fault_of_a_test(here, monkeypatch):
-    monkeypatch.setattr(batch_work, "fit", lambda *_, **__: (_ for _ in ()).throw(MemoryError()))
-    frame = again().set_index("test")
-    assert "its fit was lost (MemoryError" in frame.loc["a", "error"]
-    assert names("out") == [
-        "bad",
-        "summary.csv",
-        "summary.html",
-        "summary.tex",
-    ]  # no result of the test, so the next call retries it
 
 
 @pytest.mark.parametrize(
@@ -371,10 +296,7 @@ def test_a_wrong_call_is_one_sentence_and_nothing_is_written(here, monkeypatch, 
     # Otherwise the announcement of a compilation could come before the refusal.
     monkeypatch.setattr(module.cache, "compiled", lambda *_: True)
     before = sorted(here.rglob("*"))
-    result = run("batch", *words)
-    assert (result.exit_code, result.stdout) == (1, "")
-    assert re.fullmatch(r"foamfit: [^\n]+\n", result.stderr)
-    assert told in result.stderr
+    assert told in run_refused("batch", *words)
     assert sorted(here.rglob("*")) == before
 
 
@@ -460,13 +382,11 @@ def test_a_scheduler_that_cannot_be_reached_is_one_sentence(here, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(command, "PATIENCE", 0.3)
     for address in ("tcp://127.0.0.1:1", "nonsense://x"):
-        result = run("batch", "tests", "--scheduler", address, "--out", "out")
-        assert (result.exit_code, result.stdout) == (1, "")
-        assert re.fullmatch(r"foamfit: --scheduler [^\n]+no Dask scheduler[^\n]+\n", result.stderr)
+        told = run_refused("batch", "tests", "--scheduler", address, "--out", "out")
+        assert re.match(r"foamfit: --scheduler .+no Dask scheduler", told)
     monkeypatch.setitem(sys.modules, "dask.distributed", None)
-    result = run("batch", "tests", "--scheduler", "tcp://127.0.0.1:1")
-    assert result.exit_code == 1
-    assert result.stderr.endswith('is not installed: pip install "foamfit[dask]"\n')
+    told = run_refused("batch", "tests", "--scheduler", "tcp://127.0.0.1:1")
+    assert told.endswith('is not installed: pip install "foamfit[dask]"\n')
     assert not Path("out").exists()
 
 

@@ -7,17 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import foamfit as ff
-from conftest import DATA, few_bytes, needs_data, thinned, without_pictures
-from cycled import FRESH, ONSETS, SETS, write_record
-from foamfit.cli import main
+from conftest import (
+    DATA,
+    few_bytes,
+    needs_data,
+    run,
+    run_refused,
+    specimen_toml,
+    thinned,
+    without_pictures,
+)
+from cycled import ONSETS, SETS, write_record
 from foamfit.report.studies import cycles as cycles_report
-
-
-def springs():
-    return [replace(FRESH, eps_a=onset) for onset in ONSETS]
 
 
 @pytest.fixture(scope="module")
@@ -46,13 +49,6 @@ def test_a_cycle_that_is_not_there_is_a_row_with_its_sentence(found):
     assert row["status"] == "refused"
     assert row["error"] == found.refused[7]
     assert np.isnan(row["s1_k0"])
-
-
-def test_a_cycle_that_the_record_lacks_is_a_wrong_call(record, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    told = CliRunner().invoke(main, ["fit", str(record), "--cycle", "1,99"])
-    assert (told.exit_code, told.stdout, list(tmp_path.iterdir())) == (1, "", [])
-    assert "has no cycle 99; its cycles are 1 to 3" in told.stderr
 
 
 @pytest.mark.parametrize("at", ["reading", "fit"])
@@ -109,15 +105,10 @@ def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path,
 # -------------------------------------------------------------------------------- the command
 
 
-def run(*words):
-    return CliRunner().invoke(main, [str(word) for word in words])
-
-
 @pytest.mark.parametrize("cycle", ["0", "x", "1,,2", "-1", "1.5", ""])
 def test_what_is_no_cycle_is_refused(record, tmp_path, cycle):
-    result = run("fit", record, "--cycle", cycle, "--out", tmp_path / "out")
-    assert result.exit_code == 1
-    assert "must be a number from 1 up, several as 1,2,10, or all" in result.stderr
+    told = run_refused("fit", record, "--cycle", cycle, "--out", tmp_path / "out")
+    assert "must be a number from 1 up, several as 1,2,10, or all" in told
     assert not (tmp_path / "out").exists()
 
 
@@ -131,29 +122,13 @@ def test_one_cycle_is_fitted_as_any_test(record, tmp_path, monkeypatch):
     assert any("Contact of cycle 2 starts" in note for note in content["data"]["notes"])
 
 
-def test_all_cycles_are_fitted_in_turn(record, tmp_path, monkeypatch):
-    without_pictures(monkeypatch)
-    monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
-    monkeypatch.setattr(cycles_report.figures, "write_both", few_bytes)
-    words = ("fit", record, "--cycle", "all", "--starts", 2, "--out", tmp_path / "out")
-    result = run(*words, "--fix", "s1_kc=20e6")
-    assert result.exit_code == 0
-    assert "3 of 3 cycles fitted" in result.stdout
-    assert (tmp_path / "out" / "cycle-3" / "fit.json").is_file()
-    assert json.loads((tmp_path / "out" / "cycles.json").read_text())["fitted"] == [1, 2, 3]
-
-
 # -------------------------------------------------------------------------------- measured foam
 
 
 @needs_data
 def test_two_cycles_of_a_shoe_foam(tmp_path):
     """Measurements: arXiv:2602.12694."""
-    toml = tmp_path / "specimen.toml"
-    toml.write_text(
-        '[specimen]\nheight = "9.903 mm"\ndiameter = "7.667 mm"\n'
-        '[columns]\ndisplacement = { column = "Gap (um)", counts_down = true }\n'
-    )
+    toml = specimen_toml(tmp_path, 9.903, 7.667)
     record = DATA / "shoe-foam-twins" / "new-heel-comp-1_raw.txt"
     path = thinned(record, tmp_path, 2)
     options = {"model": "microscale", "relaxation": 1, "intervals": "local"}

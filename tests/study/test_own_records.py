@@ -5,7 +5,6 @@ with foamfit). Each has its own clock, zeros and striker.
 """
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,12 +12,9 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import EXPERIMENTS
+import rig
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.identified import read_source
-
-sys.path.insert(0, str(EXPERIMENTS / "recovery"))
-import rig
 
 SPRING = tuple(f"s1_{name}" for name in (
     "k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta",
@@ -155,27 +151,6 @@ def test_the_band_holds_what_a_noisy_motion_leaves_uncertain(tmp_path):
         curve = one.curves["stress_strain"]
         assert curve.half_width_of("motion") > 0.0
         assert "stress half width, motion (Pa)" in one.columns
-
-
-# ------------------------------------------------------------------------------- a weighed motion
-
-
-def test_a_joint_fit_weighs_each_driving_motion(tmp_path, monkeypatch):
-    write_slow(tmp_path, (20, 21, 22))
-    shared = '\ns1_k0 = "shared"\ns1_kc = "shared"\ns1_sigma_plus = "shared"'
-    (tmp_path / "study.toml").write_text(
-        'tests = ["t*.csv"]\nmodel = "microscale"\ndrive = "displacement"\nstarts = 2\n'
-        f"[parameters]{shared}\n"
-    )
-    found = ff.joint(tmp_path / "study.toml", jobs=1)
-    problems = found.fit.found.problems
-    whole = [problem.objective.weighing for problem in problems]
-    assert all(one is not None for one in whole)
-    # Sharing values raises chi-square by no more than noise does, as both use the same weights.
-    statistics = found.statistics
-    assert 0.0 < statistics["chisqr"] - statistics["chisqr_alone"] < 40.0
-    held = problems[0].holding("s1_k0", 1.0)
-    assert held.objective.weighing is whole[0]
 
 
 # ------------------------------------------------------------------------------- batch, page, auto

@@ -7,11 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import foamfit as ff
-from conftest import write_csv
-from foamfit.cli import main
+from conftest import run, run_refused, write_csv
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.data.rig import candidates, read_rig
 from foamfit.errors import InputError
@@ -21,7 +19,7 @@ FOAM_1 = Path(__file__).parents[2] / "experiments/foam-1"
 RIG = """\
 [striker]
 velocity = "0.9 to 4 m/s"
-masses = ["7 g", "14 g"]
+masses = ["7 g"]
 [limits]
 force = "{force} N"
 [record]
@@ -38,9 +36,9 @@ def soft():
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory):
-    """A rig with a force sensor of 400 N."""
+    """A rig with a force sensor of 200 N."""
     path = tmp_path_factory.mktemp("rig") / "RIG.toml"
-    path.write_text(RIG.format(force=400), encoding="utf-8")
+    path.write_text(RIG.format(force=200), encoding="utf-8")
     return path
 
 
@@ -82,7 +80,7 @@ def test_a_soft_hit_is_followed_by_one_that_probably_closes_the_loop(planned):
 
 
 def test_a_test_that_exceeds_the_force_of_the_sensor_is_shown_and_not_advised(planned):
-    strong = [one for one in planned.outcomes if one.force > 400.0]
+    strong = [one for one in planned.outcomes if one.force > 200.0]
     assert strong
     assert all(one.breaks >= 0.5 for one in strong)
     assert planned.advice not in strong
@@ -144,7 +142,7 @@ def test_a_quantity_is_known_better_after_the_test_that_is_chosen_for_it(soft):
 
 def test_a_rival_law_is_told_apart_by_a_test_beyond_the_first(soft):
     test = ff.read_test(FOAM_1 / "model-2-1.75mps-reconstruction.csv")
-    rival = ff.fit(test, model="microscale", intervals="local")
+    rival = ff.fit(test, model="microscale", starts=2, intervals="local")
     found = ff.plan(soft, rival)
     again = next(one for one in found.outcomes if one.candidate.repeat)
     assert found.rivals == ("microscale",)
@@ -160,7 +158,7 @@ def test_files_and_terminal(soft, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     soft.save("fits/foam/bistable", report=False)
     asked = ["plan", "fits/foam/bistable", "--for", "peak_strain at 2 m/s"]
-    ran = CliRunner().invoke(main, asked)
+    ran = run(*asked)
     assert ran.exit_code == 0, ran.output
     assert "Next test: an impact of 7 g at" in ran.output
     folder = tmp_path / "plans/foam"
@@ -200,6 +198,16 @@ def slow_test() -> Measurement:
     )  # fmt: skip
 
 
+def test_two_springs_with_a_camera_have_candidates_with_an_interior_displacement(soft, tmp_path):
+    rig = tmp_path / "RIG.toml"
+    rig.write_text(RIG.format(force=200) + "interior = true\n", encoding="utf-8")
+    asked = candidates(read_rig(rig, soft.measurement), soft.measurement, 2)
+    assert {one.interior for one in asked} == {None, 1}
+    text = next(one for one in asked if one.interior).toml(soft.measurement)
+    assert "displacement_1" in text
+    assert tomllib.loads(text)["specimen"]["height"] == "1.19 mm"
+
+
 def test_a_slow_test_is_followed_by_cycles_and_holds():
     result = ff.fit(slow_test(), model="microscale", relaxation=1)
     found = ff.plan(result)
@@ -210,16 +218,6 @@ def test_a_slow_test_is_followed_by_cycles_and_holds():
     slow = [one for one in found.outcomes if one.candidate.rate < 0.1]
     share = {id(one): one.expected["s1_tau1"].share for one in (*fast, *slow)}
     assert min(share[id(one)] for one in fast) < min(share[id(one)] for one in slow)
-
-
-def test_two_springs_with_a_camera_have_candidates_with_an_interior_displacement(soft, tmp_path):
-    rig = tmp_path / "RIG.toml"
-    rig.write_text(RIG.format(force=400) + "interior = true\n", encoding="utf-8")
-    asked = candidates(read_rig(rig, soft.measurement), soft.measurement, 2)
-    assert {one.interior for one in asked} == {None, 1}
-    text = next(one for one in asked if one.interior).toml(soft.measurement)
-    assert "displacement_1" in text
-    assert tomllib.loads(text)["specimen"]["height"] == "1.19 mm"
 
 
 @pytest.mark.parametrize(
@@ -253,14 +251,12 @@ def test_what_cannot_be_planned_is_refused(soft, tmp_path):
         ff.plan()
     with pytest.raises(InputError, match="peak_force"):
         ff.plan(soft, quantity="mass at 3 m/s")
-    ran = CliRunner().invoke(main, ["plan", str(tmp_path / "missing")])
-    assert ran.exit_code == 1
-    assert len(ran.output.strip().splitlines()) == 1
+    run_refused("plan", tmp_path / "missing")
 
 
 def test_init_writes_a_draft_of_the_rig_that_can_be_read(soft, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert CliRunner().invoke(main, ["init", "--rig", "RIG.toml"]).exit_code == 0
+    assert run("init", "--rig", "RIG.toml").exit_code == 0
     text = (tmp_path / "RIG.toml").read_text(encoding="utf-8")
     (tmp_path / "all.toml").write_text(
         text.replace("\n# ", "\n").replace("\nLines", "\n# Lines"), encoding="utf-8"
@@ -268,7 +264,7 @@ def test_init_writes_a_draft_of_the_rig_that_can_be_read(soft, tmp_path, monkeyp
     rig = read_rig(tmp_path / "all.toml", soft.measurement)
     assert (rig.velocity, rig.masses, rig.force) == ((0.5, 6.0), (0.007, 0.014), 500.0)
     assert rig.notes == ()
-    assert CliRunner().invoke(main, ["init", "--rig", "RIG.toml"]).exit_code == 1
+    assert run("init", "--rig", "RIG.toml").exit_code == 1
 
 
 def test_what_the_rig_does_not_state_is_taken_from_the_record_and_said():

@@ -23,7 +23,6 @@ from foamfit.fitting.problem import make_problem
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import responses
 
-SPRING = ff.published["foam-1/model-1"].bistable
 STRESSES = ("s1_k0", "s1_kc", "s1_dsigma", "s1_kh_plus", "s1_kh_minus")
 STRAINS = ("s1_eps_a", "s1_eps_c")
 MICRO = ff.MicroscaleSpring(4.4e5, 4.9e5, 0.29, 1.06e5, 0.44, 6e4, 0.7)
@@ -153,26 +152,6 @@ def test_velocity_and_mass_with_a_deviation_are_fitted_within_it(tmp_path):
         assert result.budget.contributions[name]["mass"] == 0.0
 
 
-def test_a_force_only_record_leaves_the_velocity_at_its_prior(tmp_path):
-    """The record does not determine the velocity, so its standard deviation is that of the TOML."""
-    path = written(tmp_path, **SIZE, velocity="2 ± 0.02 m/s")
-    table = np.loadtxt(path, delimiter=",", skiprows=1)
-    np.savetxt(path, table[:, :2], "%.12g", ",", header="time (ms),force (N)", comments="")
-    result = fitted(ff.read_test(path))
-    velocity = result.parameters["velocity"]
-    assert velocity.value == pytest.approx(2.0, abs=0.03)
-    assert velocity.stderr <= 0.0205
-    held = fitted(ff.read_test(path), params=_held(path))
-    assert not held.params["velocity"].vary
-    assert held.budget.contributions["s1_kc"]["velocity"] > 0.0
-
-
-def _held(path: Path) -> Any:
-    params = ff.make_params(ff.read_test(path), "bistable")
-    params["velocity"].set(value=2.0, vary=False)
-    return params
-
-
 def test_a_force_that_is_mass_times_acceleration_does_not_tell_the_mass(tmp_path):
     """Every stress is then exactly proportional to the mass, which is therefore not fitted."""
     path = written(tmp_path, **SIZE, mass="7 g ± 1 %")
@@ -198,19 +177,6 @@ def test_the_parts_of_the_noise_add_up_to_the_standard_error():
         assert all(part > 0.0 for part in parts), name
         assert math.hypot(*parts) == pytest.approx(result.parameters[name].stderr)
         assert result.budget.combined(name) == pytest.approx(math.hypot(*parts, row["area"]))
-
-
-def test_what_the_contact_adds_is_gone_where_it_is_known():
-    """The noise contribution equals the standard error of a fit with fixed contact and zero."""
-    _, test = synthetic_impact()
-    free = fitted(test)
-    params = ff.make_params(test, "bistable")
-    for name in ("contact_time", "displacement_zero"):
-        params[name].set(value=0.0, vary=False)
-    held = fitted(test, params=params)
-    for name in (*STRESSES, *STRAINS):
-        alone = free.budget.contributions[name]["noise"]
-        assert alone == pytest.approx(held.parameters[name].stderr, rel=0.15)
 
 
 def test_heights_of_a_chain(tmp_path):

@@ -5,17 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.linalg import toeplitz
-from scipy.signal import lfilter
 
+from conftest import correlated
 from foamfit.trust.best_point import growth
 from foamfit.trust.covariance import Block, Uncertainty, covariance, half_width, state
 from foamfit.trust.residuals.noise_process import NoiseProcess, autocorrelation_time
-
-
-def ar1(n: int, rho: float, seed: int) -> np.ndarray:
-    """Return first-order autoregressive noise of unit variance."""
-    white = np.random.default_rng(seed).standard_normal(n + 500)
-    return lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], white)[500:]
 
 
 def about(value: float, half: float) -> tuple[tuple[float, float], str]:
@@ -25,12 +19,17 @@ def about(value: float, half: float) -> tuple[tuple[float, float], str]:
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.8, 0.9])
 def test_autocorrelation_time_of_an_autoregressive_noise(rho):
     """The closed form is τ = (1+ρ)/(1-ρ)."""
-    found = np.mean([autocorrelation_time(ar1(4000, rho, seed)) for seed in range(20)])
+    found = np.mean(
+        [
+            autocorrelation_time(correlated(np.random.default_rng(seed), 4000, rho))
+            for seed in range(20)
+        ]
+    )
     assert found == pytest.approx((1 + rho) / (1 - rho), rel=0.15)
 
 
 def test_the_degrees_of_freedom_are_the_effective_samples_without_those_of_the_parameters():
-    residual = ar1(4000, 0.8, 0)
+    residual = correlated(np.random.default_rng(0), 4000, 0.8)
     found = covariance(np.ones((4000, 1)), residual, (4000,), np.ones(1))
     assert found.freedom == pytest.approx([found.effective - 1.0])
     assert found.effective == pytest.approx(4000 / 9.0, rel=0.2)
@@ -45,7 +44,7 @@ def test_the_error_of_a_line_covers_its_scatter(rho):
     scatter = np.sqrt(np.diag(pull @ toeplitz(rho ** np.arange(x.size)) @ pull.T))
     errors = []
     for seed in range(40):
-        y = ar1(x.size, rho, seed)
+        y = correlated(np.random.default_rng(seed), x.size, rho)
         residual = y - jacobian @ (pull @ y)
         errors.append(covariance(jacobian, residual, (x.size,), np.ones(2)).stderr)
     assert np.mean(errors, axis=0) == pytest.approx(scatter, rel=0.15)
@@ -98,15 +97,6 @@ def test_the_half_width_is_that_of_students_t():
 )
 def test_states(half, value, expected):
     assert state("s1_k0", value, about(value, half), 1.0, (0.0, 10.0))[0] == expected
-
-
-def test_parameters_that_no_curve_follows_have_no_covariance():
-    flat, ones = np.zeros((50, 2)), np.ones(50)
-    noise = [NoiseProcess(np.empty(0), 1.0)]
-    block = Block(flat, ones, (50,), noise, np.eye(2), gradient=lambda _, step: 0.0 * step)
-    found = Uncertainty((block,), np.ones(2)).covariance
-    assert np.isnan(found.matrix).all()
-    assert np.isnan(found.inflation).all()
 
 
 def test_the_growth_to_a_further_cycle_is_that_of_predicted_repetitions():

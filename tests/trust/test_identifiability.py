@@ -9,23 +9,18 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import AREA, EXPERIMENTS, HEIGHT, loop_measurement, synthetic_impact, synthetic_loop
+from conftest import AREA, HEIGHT, loop_measurement, synthetic_impact, synthetic_loop
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
-from foamfit.fitting.branches import FLIGHT, sections
 from foamfit.fitting.objective import Spent
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.report.comparison import published_side
 from foamfit.report.summary import summary_text
 from foamfit.results import Intervals
-from foamfit.springs.chain import Impact
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.checklist import Check, status_of
 from foamfit.trust.conclude import conclude
 from foamfit.trust.identifiability import Insight
 
-IMPACT = Impact(mass=7e-3, velocity=1.75)
-SLOW = EXPERIMENTS / "foam-1" / "model-1-1.75mps-reconstruction.csv"
 AGREED = ((1.0, 5), (4.0, 2))
 
 
@@ -67,9 +62,6 @@ def insight_of(scaled: np.ndarray, values: np.ndarray | None = None) -> Insight:
     triangles = np.array([np.linalg.qr(half, mode="r") for half in halves])
     parts = (("stress_time", "a"), ("stress_time", "d"))
     return Insight(tuple("pqrst"[:k]), values, np.abs(values), parts, triangles)
-
-
-# ---------------------------------------------------------------- expected errors
 
 
 # ---------------------------------------------------------------- directions in words
@@ -127,14 +119,6 @@ def test_a_combination_is_named_with_its_powers(
     assert told == said or ("compensated" in said and said in told)
 
 
-def test_a_zero_has_no_powers() -> None:
-    """The origin of the coordinate is arbitrary, so powers of it have no meaning."""
-    plain = insight_of(100 * np.column_stack([X, -X, 1 - X]))
-    insight = replace(plain, names=("contact_time", "displacement_zero", "s1_k0"))
-    told = insight.combination("contact_time", 1.0)
-    assert told == "compensated by displacement_zero (+1) (relative changes)"
-
-
 def test_the_weakest_direction_is_told_in_words() -> None:
     alike = insight_of(np.column_stack([X, X * (1 + 1e-3 * X), 50 * (1 - X)]))
     error, parts = alike.weakest()
@@ -165,23 +149,6 @@ def test_the_shares_of_the_information_add_up_and_lie_where_the_branch_is() -> N
     assert where["s1_kh_plus"]["d"] > 0.99
     assert where["s1_kc"]["c"] > 0.99
     assert where["s1_k0"]["a"] > 0.99
-
-
-def test_the_sections_are_those_of_the_branches_in_time() -> None:
-    spring, test = synthetic_impact()
-    problem = problem_of(test)
-    best = best_of(problem, spring)
-    result = conclude(best, SearchRecord(0, 1, 0.0, AGREED))
-    labels = sections(problem, best.simulated)
-    assert list(dict.fromkeys(labels)) == ["a", "d", "c", "e", FLIGHT]
-    assert len(labels) == test.time.size
-    starts = [i for i in range(1, len(labels)) if labels[i] != labels[i - 1]]
-    assert len(starts) == 4
-    for start, switch in zip(starts, result.switches, strict=False):
-        assert test.time[start - 1] < switch.time <= test.time[start]
-    before = [i for i, (_, label) in enumerate(result.insight.parts) if label in ("a", "d")]
-    kc = result.insight.triangles[before, :, result.insight.names.index("s1_kc")]
-    assert not kc[: len(before) // 2].any()  # no sample before branch c depends on k_c
 
 
 # ---------------------------------------------------------------- the checklist
@@ -267,31 +234,6 @@ def test_trials_that_fail_and_masses_that_ring_are_asked_after() -> None:
     assert "determined" not in {p.state for p in result.parameters.values()}
 
 
-def test_a_chain_too_short_to_trust_is_warned_of() -> None:
-    told = "The chain is too short."
-    result = concluded(intervals=Intervals(warnings=(told,)))
-    assert answers(result)["intervals"] is False
-    assert (result.status, result.warnings) == ("warnings", (told,))
-
-
-def test_the_standard_error_is_local_whatever_made_the_interval() -> None:
-    """It does not depend on the seed; a very different interval is mentioned in the reason."""
-    local = concluded().parameters["s1_k0"]
-    low, high = local.ci95
-    half, profiled = (high - low) / 2, {"s1_k0": "profile likelihood"}
-    near = concluded(intervals=Intervals({"s1_k0": (low, 1.001 * high)}, profiled))
-    assert near.parameters["s1_k0"].stderr == local.stderr
-    assert "local standard error" not in near.parameters["s1_k0"].why
-    for width, method in ((5.0, "profile likelihood"), (0.1, "mcmc")):
-        ends = (local.value - width * half, local.value)
-        other = concluded(intervals=Intervals({"s1_k0": ends}, {"s1_k0": method}))
-        found = other.parameters["s1_k0"]
-        assert found.stderr == local.stderr
-        assert found.ci95 == pytest.approx(ends)
-        assert other.params["s1_k0"].stderr == found.stderr
-        assert found.why.endswith("; the local standard error implies a very different interval")
-
-
 def test_a_profile_much_narrower_than_the_local_interval_is_not_taken() -> None:
     """A profile is too narrow if its refits stall where the cost is flat."""
     local = concluded().parameters["s1_k0"]
@@ -315,15 +257,6 @@ def test_what_the_test_does_not_say_is_neither_yes_nor_no() -> None:
     assert result.status == "ok"
 
 
-def test_the_status_follows_from_the_answers() -> None:
-    def made(*told: tuple[bool | None, bool]) -> list[Check]:
-        return [Check("key", "question?", answer, "", (), fatal) for answer, fatal in told]
-
-    assert status_of(made((True, False), (None, False))) == "ok"
-    assert status_of(made((True, True), (False, False))) == "warnings"
-    assert status_of(made((False, False), (False, True))) == "failed"
-
-
 def test_a_damper_that_may_be_none_is_not_called_determined() -> None:
     spring, test = synthetic_impact(eta=8.0)
     problem = problem_of(test, damped=True)
@@ -341,20 +274,3 @@ def test_a_damper_that_may_be_none_is_not_called_determined() -> None:
     problem = problem_of(test, damped=True)
     result = conclude(best_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
     assert result.parameters["s1_eta"].state == "determined"
-
-
-# ---------------------------------------------------------------- report
-
-
-# ---------------------------------------------------------------- branches not reached
-
-
-def test_what_was_never_reached_is_said_first() -> None:
-    slow = concluded(synthetic_impact(velocity=1.75, samples=201)[1])
-    start = (
-        "s1_kc, s1_dsigma, s1_eps_c and s1_kh_minus cannot be determined: no branch they act on "
-    )
-    assert slow.insight.sentence().startswith(start + "was reached. The least determined ")
-    warning = next(w for w in slow.warnings if w.startswith("Not determined"))
-    assert "s1_kc (branch c of spring 1 was never reached)" in warning
-    assert "s1_dsigma, s1_eps_c, s1_kh_minus (branch e of spring 1 was never reached)" in warning

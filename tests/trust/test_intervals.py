@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import importlib.util
 import json
-import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,37 +12,27 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from matplotlib.figure import Figure
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 import foamfit as ff
-from conftest import EXPERIMENTS, loop_measurement, synthetic_impact
-from foamfit import one_model
-from foamfit.cli import main
+from conftest import EXPERIMENTS, correlated, loop_measurement, run, run_refused, synthetic_impact
 from foamfit.data.measurement import Specimen, Striker
 from foamfit.errors import InputError
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord, Tracker
-from foamfit.one_model import Found, Options, judge
+from foamfit.one_model import Found, judge
 from foamfit.report import result_figures
 from foamfit.report.result_figures import plot_profiles
 from foamfit.results import Profile
-from foamfit.trust import intervals, markov_chain
+from foamfit.trust import intervals
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.intervals import Choice, assess
 from foamfit.trust.markov_chain import mcmc
-from foamfit.trust.profile import departures, trace
+from foamfit.trust.profile import trace
 from foamfit.trust.residuals.noise_process import NoiseProcess, noise_processes
-
-sys.path.insert(0, str(EXPERIMENTS / "recovery"))
-
-
-def autoregressive(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:
-    white = rng.standard_normal(n + 500)
-    return lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], white)[500:]
 
 
 def profile(best: BestPoint, name: str) -> Profile:
@@ -113,7 +102,7 @@ def curve(
     rng = np.random.default_rng(5)
     time = np.linspace(-1, 1, n)
     bench = Bench(Curve(time, np.zeros(n), bend), low)
-    noise = autoregressive(rng, n, rho)
+    noise = correlated(rng, n, rho)
     bench.objective.data = bench.objective.model(np.array([1.0, slope])) + 0.1 * noise
     best = least_squares(bench.objective.residual, [1.0, slope], xtol=1e-14, ftol=1e-14).x
     return BestPoint(bench, best, ("a", "b"))  # type: ignore[arg-type]
@@ -186,11 +175,6 @@ def test_the_profile_of_a_linear_problem_is_the_local_interval(name, rho):
     assert found.rises == pytest.approx(expected, abs=1e-6)
     assert not found.open_low
     assert not found.open_high
-
-
-def test_a_parabola_does_not_depart_from_itself_and_a_bent_cost_does():
-    assert np.abs(departures(curve())).max() < 1e-6
-    assert np.abs(departures(curve(bend=100.0, slope=0.01))).max() > intervals.BENT
 
 
 def test_a_limit_ends_an_interval():
@@ -303,23 +287,6 @@ def test_an_interrupted_profile_keeps_what_was_done(impact, monkeypatch):
     assert local.split(", ") == [name for name in impact.names if name not in found.ends]
 
 
-def test_a_time_that_is_up_ends_profiles_too(impact):
-    found = assess(impact, Choice("profile"), Tracker(impact.problem.objective, 0.0))
-    assert found.ends == {}
-    assert not found.profiles[0].complete
-
-
-def test_a_better_point_is_told(impact):
-    """A profile around a point that is not the minimum returns a better starting point."""
-    values = impact.values.copy()
-    values[impact.problem.index["s1_kc"]] *= 1.01
-    off = BestPoint(impact.problem, values, impact.names)
-    found = assess(off, Choice("profile"))
-    assert found.better is not None
-    residual = impact.problem.objective.residual(found.better)
-    assert residual @ residual < off.cost
-
-
 # ---------------------------------------------------------------- Markov chains
 
 
@@ -397,32 +364,6 @@ def test_nothing_is_drawn_where_nothing_is_determined(method):
     assert (by_default.ends, by_default.warnings) == ({}, ())
 
 
-def test_where_nothing_can_be_simulated_a_chain_gives_up():
-    pytest.importorskip("emcee")
-
-    class Alone(Levels):
-        def residual(self, values: np.ndarray) -> np.ndarray:
-            self.failures += 1
-            return super().residual(values)
-
-    around = levels(Alone)
-    assert around.known
-    before = around.problem.objective.evaluations
-    chain = mcmc(around, 100, seed=0)
-    assert len(chain.samples) == 0
-    assert "nothing can be simulated" in chain.sentence()
-    assert around.problem.objective.evaluations - before <= 3 * markov_chain.walkers(around)
-
-
-def test_a_time_that_is_up_keeps_the_fit():
-    around = levels()
-    found = assess(around, Choice("mcmc", 200), Tracker(around.problem.objective, 0.0))
-    assert found.ends == {}
-    (told,) = found.warnings
-    assert "stopped by the time limit" in told
-    assert "the intervals are local" in told.lower()
-
-
 @pytest.mark.parametrize("after", [5, 900])
 def test_ctrl_c_keeps_what_was_drawn(after, monkeypatch, capsys):
     """This includes Ctrl-C during the first draws; emcee's own message is suppressed."""
@@ -433,18 +374,6 @@ def test_ctrl_c_keeps_what_was_drawn(after, monkeypatch, capsys):
     assert found.notes == ()
     assert "stopped by Ctrl-C" in found.warnings[0]
     assert capsys.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize(
-    ("method", "draws", "word"),
-    [
-        ("guess", None, "'guess' .* must be one of auto, local, profile, mcmc"),
-        ("mcmc", 5, "draws = 5 .* from 100"),
-    ],
-)
-def test_refuses_what_cannot_be_done(method, draws, word):
-    with pytest.raises(InputError, match=word):
-        Options(intervals=method, draws=draws)
 
 
 def test_says_in_one_sentence_that_emcee_is_missing(monkeypatch):
@@ -482,11 +411,10 @@ def test_the_result_says_what_made_each_interval(tmp_path: Path, monkeypatch):
 def test_the_command_makes_intervals_one_way_and_tells_the_cost(tmp_path: Path):
     test = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
     call = ["fit", str(test), "--starts", "2", "--out", str(tmp_path / "out")]
-    refused = CliRunner().invoke(main, [*call, "--profile", "--mcmc", "200"])
-    assert refused.exit_code == 1
-    assert "--profile and --mcmc exclude each other" in refused.stderr
+    told = run_refused(*call, "--profile", "--mcmc", "200")
+    assert "--profile and --mcmc exclude each other" in told
     assert not (tmp_path / "out").exists()
-    done = CliRunner().invoke(main, [*call, "--mcmc", "100", "--json", "--no-report"])
+    done = run(*call, "--mcmc", "100", "--json", "--no-report")
     assert done.exit_code == 0
     assert "intervals by mcmc: 2626 simulations, about" in done.stderr
     content = json.loads(done.stdout)
@@ -494,7 +422,6 @@ def test_the_command_makes_intervals_one_way_and_tells_the_cost(tmp_path: Path):
     assert any("Markov chain of 26 walkers and 100 steps" in note for note in content["warnings"])
 
 
-PROFILE = "profile likelihood"
 AGREED = SearchRecord(0, 8, 0.0, ((1.0, 8),))
 
 
@@ -519,7 +446,7 @@ def test_an_interval_is_in_order_and_holds_its_value(impact, method, seed):
             assert item.stderr > 0.0
 
 
-def test_what_is_within_rounding_of_its_limit_is_at_it(impact, monkeypatch):
+def test_what_is_within_rounding_of_its_limit_is_at_it(impact):
     problem, at = impact.problem, impact.index["s1_dsigma"]
     values = impact.values.copy()
     values[at] = -3e-15
@@ -531,24 +458,6 @@ def test_what_is_within_rounding_of_its_limit_is_at_it(impact, monkeypatch):
     assert item.state == "weak"
     assert "lies at its limit 0" in item.why
     assert item.ci95[1] == 0.0
-    # A parameter is not moved to its limit if that would increase the cost.
-    monkeypatch.setattr(one_model, "AT_LIMIT", 1.0)
-    tracker = Tracker(problem.objective, best_values=impact.values, best_cost=impact.cost)
-    _, best = judge(Found(problem, tracker, AGREED), Choice("local"), lambda _: None)
-    np.testing.assert_array_equal(best.values, impact.values)
-
-
-def test_a_profile_that_its_limit_cuts_is_not_called_narrow(impact):
-    values = impact.values.copy()
-    values[impact.index["s1_dsigma"]] = 0.0
-    around = BestPoint(impact.problem, values, impact.names)
-    column = impact.names.index("s1_dsigma")
-    half = around.quantiles[column] * around.spread.stderr[column]
-    made = intervals.Intervals({"s1_dsigma": (-0.9 * half, 0.0)}, {"s1_dsigma": PROFILE})
-    item = conclude(BestPoint(impact.problem, values), AGREED, made).parameters["s1_dsigma"]
-    assert item.ci95_method == PROFILE
-    assert item.ci95 == pytest.approx((-0.9 * half, 0.0))
-    assert item.stderr == pytest.approx(around.spread.stderr[column])
 
 
 def test_the_ends_of_a_profile_do_not_depend_on_rounding():

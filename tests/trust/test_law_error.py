@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from scipy.signal import lfilter
 from scipy.stats import binom
 
 import foamfit as ff
-from conftest import DATA, EXPERIMENTS, loop_measurement, needs_data
+import law_error
+import real_foams
+import studies
+from conftest import DATA, correlated, loop_measurement, needs_data
 from foamfit.api import FitResult
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.fitting.problem import Problem, make_problem
@@ -23,9 +24,7 @@ from foamfit.report.folder import load_result
 from foamfit.report.readable import readable
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import (
-    NOTHING,
     RULE,
-    WEAK,
     Block,
     Uncertainty,
     covariance,
@@ -34,17 +33,6 @@ from foamfit.trust.profile import Refit
 from foamfit.trust.ranges import ALIKE, alike, left_open, tolerance
 from foamfit.trust.residuals.law_error import curve_errors
 from foamfit.trust.residuals.noise_process import NoiseProcess
-
-sys.path.insert(0, str(EXPERIMENTS))
-sys.path.insert(0, str(EXPERIMENTS / "law_error"))
-import law_error
-import real_foams
-import studies
-
-
-def noise(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:
-    white = rng.standard_normal(n + 500)
-    return lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], white)[500:]
 
 
 def wave(n: int) -> np.ndarray:
@@ -67,7 +55,7 @@ def of(residual: np.ndarray):
 def test_noise_of_first_order_is_no_error_of_the_law(n, rho):
     """Nine records per case, all of them noise only."""
     rng = np.random.default_rng(11)
-    found = [of(noise(rng, n, rho)) for _ in range(9)]
+    found = [of(correlated(rng, n, rho)) for _ in range(9)]
     assert not any(one.found for one in found)
     assert all(one.evidence < 0.0 for one in found)
 
@@ -75,7 +63,7 @@ def test_noise_of_first_order_is_no_error_of_the_law(n, rho):
 @pytest.mark.parametrize("size", [1.0, 3.0, 30.0])
 def test_the_noise_beside_an_error_of_the_law_is_that_of_the_high_frequencies(size):
     rng = np.random.default_rng(3)
-    found = [of(size * wave(800) + noise(rng, 800, 0.0)) for _ in range(5)]
+    found = [of(size * wave(800) + correlated(rng, 800, 0.0)) for _ in range(5)]
     assert all(one.found for one in found)
     power = [one.noise.variance * one.noise.tau for one in found]
     assert np.mean(power) == pytest.approx(1.0, rel=0.1)
@@ -227,18 +215,6 @@ def test_every_description_in_the_range_follows_the_curves_about_as_well():
             assert item.ci95 is None or np.ptp(item.range) > 0.0
 
 
-def test_the_range_decides_where_it_is_wider():
-    result, best, _ = fitted(0)
-    for name, item in result.parameters.items():
-        if item.range is None or item.state == "fixed" or name == "s1_dsigma":
-            continue
-        size = float(best.problem.sizes((name,), best.values)[0])
-        half = 0.5 * max(np.ptp(item.range), np.ptp(item.ci95)) / size
-        expected = "determined" if half <= WEAK else "weak" if half <= NOTHING else "not determined"
-        assert item.state == expected
-        assert "its range is" in item.why or "95 % interval" in item.why
-
-
 def test_the_result_says_what_was_decided(tmp_path):
     result, best, _ = fitted(0)
     told = result.noise["stress_strain"]
@@ -274,16 +250,10 @@ def test_there_is_no_range_where_the_law_follows_the_curves():
     assert report.range == ""
 
 
-def test_the_search_finds_the_soft_branch_c():
-    """Without starts on this branch, the best of 16 descents has a misfit of 1.9 %, not 1.15 %."""
-    best = fitted(None)[1]
-    assert best.problem.objective.misfit(best.simulated)["stress_strain"] < 0.012
-
-
 @needs_data
 def test_twins_get_the_same_states(thin_foams, tmp_path):
     states, values = {}, {}
-    for foam in ("turbo-comp", "leap-comp", "worn-heel-comp"):
+    for foam in ("turbo-comp", "worn-heel-comp"):
         for test in real_foams.first_cycles(thin_foams, tmp_path, (foam,)):
             for name, item in real_foams.varied(ff.fit(test, starts=2)).items():
                 states.setdefault((foam, name), []).append(item.state)
