@@ -3,7 +3,9 @@
 The motion of a rigid striker follows from its equation of motion, whatever the law of the specimen:
 w = w₀ + v t + g t²/2 − (A/m) ∬σ. Fitted to the measured motion by least squares, it shows the
 velocity v at contact, and the factor of the double integral, which is 1 if mass, force and motion
-agree. The zero of the force and its delay against the motion are left open.
+agree. The zero of the force and its delay against the motion are left open. An onsite damper of the
+striker, whose force the sensor at the base does not see, adds -(η A/(H m)) ∫(w - w(0)); it is
+assumed where it alone makes all numbers agree.
 """
 
 from __future__ import annotations
@@ -39,12 +41,14 @@ class Balance:
     """What the equation of motion of the striker shows; None if it does not show a number.
 
     `velocity` is that at contact, m/s; `force` is the factor by which the measured force must be
-    multiplied, 1 if mass, force and motion agree; `delay` is that of the motion against the force.
+    multiplied, 1 if mass, force and motion agree; `delay` is that of the motion against the force,
+    s; `damping` is the η of an onsite damper of the striker, Pa s.
     """
 
     velocity: Shown | None = None
     force: Shown | None = None
     delay: Shown | None = None
+    damping: Shown | None = None
 
 
 @dataclass(frozen=True)
@@ -79,11 +83,20 @@ class Contradiction:
         return bool(free & strong) and (self.quantity == "force_scale" or "velocity" in free)
 
 
-def contradictions(test: Measurement) -> tuple[Contradiction, ...]:
-    """Return the numbers that the record of an impact contradicts, the velocity first."""
-    shown, striker, found = balance(test), test.striker, list[Contradiction]()
+def contradictions(test: Measurement, shown: Balance | None = None) -> tuple[Contradiction, ...]:
+    """Return the numbers that the record of an impact contradicts, the velocity first.
+
+    `shown` is its `balance`, if that is known.
+    """
+    shown = balance(test) if shown is None else shown
+    return (*_of_striker(test, shown), *_of_delay(test, shown.delay))
+
+
+def _of_striker(test: Measurement, shown: Balance) -> list[Contradiction]:
+    """Return the contradictions of velocity, mass and scales of force and motion."""
+    striker, found = test.striker, list[Contradiction]()
     if striker is None or not striker.velocity or not striker.mass:
-        return ()
+        return []
     if shown.velocity is not None:
         speed, error = shown.velocity
         ratio, limit = speed / striker.velocity, _limit(test, error / striker.velocity, "velocity")
@@ -100,7 +113,7 @@ def contradictions(test: Measurement) -> tuple[Contradiction, ...]:
     # If the motion is too fast and too long by one factor, its scale alone may be wrong.
     if len(found) == 2 and abs(found[0].ratio / found[1].ratio - 1.0) < found[1].limit:
         found = [_of_motion(test, found[1].ratio, found[1].limit)]
-    return (*found, *_of_delay(test, shown.delay))
+    return found
 
 
 def _limit(test: Measurement, error: float, *quantities: str) -> float:
@@ -157,21 +170,25 @@ def balance(test: Measurement) -> Balance:
     integrated = "displacement" in test.derived  # from the acceleration, with the stated velocity
     if is_clipped(test) or (test.braked and integrated) or float(stress.max()) <= 0.0:
         return Balance(test.flight)
-    fitted = _fitted(with_noise(test), striker.mass, w, stress, time)
+    given = with_noise(test), striker.mass, w, stress, time
+    fitted = _fitted(*given)
     if fitted is None:
         return Balance(test.flight)
     begins = test.flight is not None or stress[0] <= _LOADED * float(stress.max())
-    return Balance(
-        fitted[0] if begins and not integrated else None,
-        None if "stress" in test.derived else fitted[1],
-        None if integrated or "stress" in test.derived or not begins else fitted[2],
-    )
+    velocity, derived = fitted.velocity if begins and not integrated else None, test.derived
+    if velocity is None or "stress" in derived:
+        return Balance(velocity, None if "stress" in derived else fitted.force)
+    damped = _fitted(*given, damped=True) if contradictions(test, fitted) else None
+    if damped is None or damped.damping is None or contradictions(test, damped):
+        return fitted
+    size, error = damped.damping
+    return damped if size > BEYOND * error else fitted
 
 
 def _fitted(
-    test: Measurement, mass: float, w: Array, stress: Array, time: Array
-) -> tuple[Shown, Shown, Shown] | None:
-    """Fit the equation of motion; return velocity, m/s, factor of the force, and delay, s."""
+    test: Measurement, mass: float, w: Array, stress: Array, time: Array, *, damped: bool = False
+) -> Balance | None:
+    """Fit the equation of motion, of a `damped` striker with an onsite damper."""
     kept = test.sampled.get("displacement", np.ones(time.size, dtype=bool))
     if (outliers := test.outliers.get("displacement")) is not None:
         kept = kept & ~outliers.left_out
@@ -181,6 +198,8 @@ def _fitted(
     lead = [0.0] * int(time[0] > 0.0)  # from time zero on, the stress rises from zero
     whole = np.append(lead, time), np.append([0.0] * len(lead), stress * per_mass)
     integrals = [part[len(lead) :] for part in integrated_twice(*whole)]
+    slipped = np.where(time > 0.0, w - np.interp(0.0, time, w), 0.0) / test.specimen.height
+    damper = -per_mass * integrated_twice(time, slipped)[0]
     # Priors of the zero of the force, which acts like an unknown gravity, and of the delay.
     peak, loaded = float(stress.max()), float(np.ptp(time[stress > 0.02 * stress.max()]))
     zero = max(min(test.zeros.get("stress", np.inf), ZERO * peak), 1e-6 * peak) * per_mass
@@ -195,7 +214,8 @@ def _fitted(
         rows = kept & (time - late <= time[-1])  # the force there is in the record
         t = time[rows]
         slowed, braked = (np.interp(t - late, time, part) for part in integrals)
-        columns = np.column_stack([np.ones(t.size), t, -braked, 0.5 * t**2, slowed])
+        columns = np.column_stack([np.ones(t.size), t, -braked, 0.5 * t**2, slowed, damper[rows]])
+        columns = columns if damped else columns[:, :-1]
         y, priors = w[rows] - 0.5 * (gravity or 0.0) * t**2, [*known, (4, -late, most)]
         found, errors = _solved(columns, y, scatter * math.sqrt(steps), priors)
         left, late = y - columns @ found, late + float(found[4] / found[2])
@@ -209,7 +229,8 @@ def _fitted(
     speed, factor = found[1:3].tolist()
     error = math.hypot(errors[1], inertia * speed)
     force = factor, math.hypot(errors[2], inertia, summed)
-    return (speed, error), force, (late, float(errors[4]) / factor)
+    damping = (float(found[5]), float(errors[5])) if damped else None
+    return Balance((speed, error), force, (late, float(errors[4]) / factor), damping)
 
 
 def _solved(

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.calibration import Contradiction, contradictions
+from foamfit.data.calibration import Contradiction, balance, contradictions
 from foamfit.data.measurement import INTEGRATED, Measurement, Striker, interior_node
 from foamfit.data.noise import line_at, noise_level
 from foamfit.data.zeros import CONTRADICTED
@@ -34,6 +34,7 @@ class EnergyAudit:
     motion: str | None = None  #: source of the displacement
     missing: tuple[str, ...] = ()  #: a sentence for each quantity that could not be computed
     contradictions: tuple[Contradiction, ...] = ()  #: numbers that the record contradicts
+    damping: float | None = None  #: η of an onsite damper that the striker's motion shows, Pa·s
 
     def as_dict(self) -> dict[str, float | str | None]:
         """Return the audit as plain values; `missing` and `warnings` are joined to one text."""
@@ -50,6 +51,8 @@ class EnergyAudit:
     def energy_warnings(self) -> list[str]:
         """Return a sentence if the foam absorbs another energy than the striker brings."""
         found, taken = [], self.absorbed_over_striker
+        if self.damping is not None:  # which takes up energy
+            return []
         if taken is not None and taken > 1.05:
             found.append(
                 f"Check: the foam absorbs {taken:.2f} times the energy that the striker brings, "
@@ -90,6 +93,11 @@ class EnergyAudit:
                 f"The impulse of the force is {self.impulse:.4g} N·s, the striker's change of "
                 f"momentum {self.momentum_change:.4g} N·s (ratio {self.impulse_ratio:.2f})."
             )
+        if self.damping is not None:
+            results.append(
+                "The striker's motion shows an onsite damper, "
+                f"η = {engineering(self.damping, 'Pa·s')}, whose force the sensor does not see."
+            )
         return [*results, *self.warnings(), *self.missing]
 
 
@@ -120,6 +128,7 @@ def audit(test: Measurement) -> EnergyAudit:
     elif dissipated is None:
         missing.append("The dissipated energy needs the unloading.")
     impulse, rebound, change = _momentum(test, unloaded)
+    shown = balance(test)
     if test.motion == INTEGRATED:
         missing.append(
             "The motion was integrated from the force, so the balances are not independent."
@@ -138,7 +147,8 @@ def audit(test: Measurement) -> EnergyAudit:
         impulse_ratio=impulse / change if impulse is not None and change else None,
         motion=test.motion,
         missing=tuple(missing),
-        contradictions=contradictions(test),
+        contradictions=contradictions(test, shown),
+        damping=None if shown.damping is None else shown.damping[0],
     )
 
 

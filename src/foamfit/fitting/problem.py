@@ -11,6 +11,7 @@ import lmfit
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data.calibration import balance
 from foamfit.data.measurement import Measurement
 from foamfit.data.units import LARGEST, parse_uncertain
 from foamfit.errors import InputError
@@ -89,6 +90,7 @@ def make_params(
         )
     params, count = lmfit.Parameters(), len(model.kinds)
     fast = drive == "impact"
+    on_striker = fast and (count > 1 or balance(measurement).damping is not None)
     if drive == "displacement" and count == 1:
         fast = replaces_striker(measurement)
     for name in model.names:
@@ -98,7 +100,7 @@ def make_params(
         param = model.param(name)
         value = param.start[0] * scales.unit(param.start[1])
         low, high = (bound * scales.unit(param.scale) for bound in param.bounds)
-        vary = short != "eta" or (fast and (spring >= 0) == (count == 1))
+        vary = short != "eta" or (on_striker if spring < 0 else fast and count == 1)
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)
     late = nuisance.is_late(measurement, time_shift=time_shift)
