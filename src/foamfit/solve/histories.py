@@ -26,7 +26,8 @@ def _given(law: Law, row: Array, history: Array, top: int, out: Array) -> tuple[
 
     Time is the number of the sample; it stands still for the law.
     """
-    row, integrated = row.copy(), compiled(law).kind == INTERNAL
+    row, made = row.copy(), compiled(law)
+    integrated = made.kind == INTERNAL and (made.flows or top == STRESS)
     row[0] = 0.0  # no dashpot
     shape = Shape((law,), 0, (1,), top, b"\0", b"", False, 0, not integrated)
     layout = lay_out(shape, integrated)

@@ -423,8 +423,8 @@ def plan(
         inside = np.flatnonzero(arrays.masses[:-1] > 0.0)
         ends = (*(inside + 1).tolist(), count)
         masses = np.append(arrays.masses[inside] / chain.area, masses)
-    internal = any(one.kind == INTERNAL for one in laws.made)
     alone = top == scenes.MOTION and count == 1
+    internal = any(one.kind == INTERNAL and (one.flows or not alone) for one in laws.made)
     damped = dashpots or arrays.damped or top == scenes.VISCOUS or internal
     if arrays.heavy or above > 0.0:
         solver = SECOND_ORDER

@@ -181,7 +181,8 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     kinds, carries = place_state(shape, numbers, nodes)
     base, internals = len(kinds), sum(one.internal for one in made)
     n = base + carries * p
-    wide, results = -4 * (-n // 4), max(results_of(one.derivatives, one.internal) for one in made)
+    results = max(results_of(one.derivatives, one.internal, p) for one in made)
+    wide = -4 * (-n // 4)
     row = RESULTS + results
     width = row + max(one.columns for one in made)
     places, groups_of, reach = order(shape, numbers, nodes) if shape.degree else ([], [], 0)
@@ -195,7 +196,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
         "scales": SCALES + count + 2 * nodes + internals,
         "now": len(NOW), "sided": p, "stage": STAGES * wide, "line": LINE * wide, "y": wide,
         "new": wide, "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
-        "batch": BATCH * (6 + BY + parameters) + 3 * p + MOST_TERMS * (9 + p),
+        "batch": BATCH * (6 + BY + parameters) + 2 * p + 8 * MOST_TERMS,
         "aside": count * (1 + shape.terms) + groups + 1 if internal else 0,
         "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,
         "largest": p if size else 0, "kept": count * width + groups if size and p else 0,

@@ -121,7 +121,7 @@ def _mend(c, y):  # type: ignore[no-untyped-def]
                     y[n.x_at] += longer * s.tangent
                 elif n.kind == INTERNAL:
                     for k in range(n.internals):
-                        y[n.x_at + k] += longer * s[RESULTS + BY + n.parameters + 2 + k]
+                        y[n.x_at + k] += longer * s[RESULTS + BY + 2 + k]
 
 
 @inner

@@ -20,6 +20,7 @@ from foamfit.springs.compiled.contract import (
     EXPLICIT,
     INTERNAL,
     OPTIONS,
+    PATHS,
     REAL,
     REALS_AT,
     RELAX,
@@ -80,7 +81,7 @@ def follow_spring(c, i, eps, y, f, want):  # type: ignore[no-untyped-def]
         for k in range(n.internals):
             s[X + k] = y[n.x_at + k]
     s.eps = eps
-    evaluate(c, i, want if kind != INTERNAL or want else 2 * n.fixed)
+    evaluate(c, i, PATHS if n.fixed and kind == INTERNAL else want)
     sigma, tangent, drift = s.sigma, s.slope, 0.0
     if kind == INTERNAL and n.fixed:
         call_inside(c, PATH, i, c.none, y, f, y, y)
@@ -103,7 +104,7 @@ def move_inside(c, i, f):  # type: ignore[no-untyped-def]
     if n.kind == BY_STRESS and not c.solved:
         f[n.x_at] = s.slope * s.rate
     elif n.kind == INTERNAL:
-        x, values = n.internals, past(s, RESULTS + BY + n.parameters)
+        x, values = n.internals, past(s, RESULTS + BY)
         for k in range(x):
             f[n.x_at + k] = values[2 + k] * s.rate + c.drive.pace * values[2 + x + k]
 
@@ -121,10 +122,11 @@ def derive_spring(c, i, y):  # type: ignore[no-untyped-def]
         a, b, held = out[BY_HELD], out[BY_HELD + 1], past(c.held, 2 * i * p)
         for j in range(p):
             part[j] = a * held[j] + b * held[p + j]
-    elif n.kind == INTERNAL:
+    if n.kind == INTERNAL:
         call_inside(c, PART, i, c.none, y, y, y, part)
-    for k in range(owned[i], owned[i + 1]):
-        part[owned[k]] += out[BY + directions[2 * owned[k] + 1]]
+    else:
+        for k in range(owned[i], owned[i + 1]):
+            part[owned[k]] += out[BY + directions[2 * owned[k] + 1]]
     gain = s.gain
     for j in range(p):
         total[j] = gain * part[j]
@@ -212,7 +214,7 @@ def _follow_one(c, g, i, y, f, want, at):  # type: ignore[no-untyped-def]
     common = follow_spring(c, i, reach * s.per_height, y, f, want) + s.eta * rate
     move_inside(c, i, f)
     if n.kind == INTERNAL:
-        common += c.drive.pace * s[RESULTS + BY + n.parameters + 1]
+        common += c.drive.pace * s[RESULTS + BY + 1]
     c.carried[g] = common
     return common
 
