@@ -182,8 +182,10 @@ class Plan(NamedTuple):
             return found
         log, endings = np.empty((logged, 5)), np.empty(loop.ENDINGS + len(directions))
         given = rows, heights, directions, out, log, endings
-        for degree in self._methods(stiff):
+        methods = self._methods(stiff)
+        for degree in methods:
             reals = self._reals(rows, heights, rtol, drag, degree)
+            reals[loop.FOLLOWED] = degree == 0 and methods[-1] > 0
             self._integrate(*given, reals, degree)
             if endings[loop.OUTCOME] not in _STIFF:
                 break
@@ -224,7 +226,7 @@ class Plan(NamedTuple):
             first = self.slopes_of(rows)[0]
             over = rates.is_overdamped(first, rows[:, 0], heights, float(self.mass[-1]))
         scales = self._scales(rows, heights)
-        return np.array((drag, 1.0, self.speed, tol, most, brief, over, *scales))
+        return np.array((drag, 1.0, self.speed, tol, most, brief, over, 0.0, *scales))
 
     def _integrate(
         self, rows: Array, heights: Array, directions: Directions, out: Array, log: Array,

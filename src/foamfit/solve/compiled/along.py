@@ -216,16 +216,6 @@ def go_to(c, eps, between, m, seed, tol, weight):  # type: ignore[no-untyped-def
             return
 
 
-@inner
-def _first(c, eps, m, seed, tol, weight):  # type: ignore[no-untyped-def]
-    """Go to the strain of the first sample, where relaxation terms carry nothing."""
-    go_to(c, eps, 0.0, m, seed, tol, weight)
-    for k in range(c.terms):
-        c.y[k] = -c.springs.sigma
-        for q in range(c.p):
-            c.y[c.base + k * c.p + q] = -c.common[q]
-
-
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
 def follow(  # type: ignore[no-untyped-def]
     template, ints, floats, rows, heights, mass, reals, strains, time, out, log, samples
@@ -245,10 +235,11 @@ def follow(  # type: ignore[no-untyped-def]
     derive(c, start(samples))
     for j in range(n):
         seed, eps = past(start(samples), 4 * j), c.values[j]
-        if j == 0:
-            _first(c, eps, m, seed, tol, weight)
-        else:
-            go_to(c, eps, t[j] - t[j - 1], m, seed, tol, weight)
+        go_to(c, eps, t[j] - t[j - 1] if j > 0 else 0.0, m, seed, tol, weight)
+        for k in range(c.terms if j == 0 else c.none):  # they carry nothing yet
+            c.y[k] = -s.sigma
+            for q in range(c.p):
+                c.y[c.base + k * c.p + q] = -c.common[q]
         sum_up(c, j)
         samples[j, 2], samples[j, 3] = s.branch, s.slope
         if not m[0] < math.inf:

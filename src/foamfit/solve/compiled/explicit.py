@@ -136,7 +136,8 @@ def take_short(c, n, dt, at, want, tol):  # type: ignore[no-untyped-def]
     for i in range(c.base):
         size = max(scales[c.kinds[i]], max(abs(y[i]), abs(new[i])))
         if size > 0.0:
-            total += (errors[i] / (tol * size)) ** 2
+            share = errors[i] / (tol * size)
+            total += share * share
     return math.sqrt(total / c.base)
 
 

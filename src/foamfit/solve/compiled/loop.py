@@ -15,13 +15,11 @@ from foamfit.solve.compiled.events import (
     TOP_END,
     TURN,
     change_branch,
-    dense,
     first_event,
     keep_values,
-    look,
     take_step,
 )
-from foamfit.solve.compiled.motion import rates
+from foamfit.solve.compiled.motion import dense, look, rates
 from foamfit.solve.compiled.run import (
     OF_EPS,
     OF_V,
@@ -50,11 +48,13 @@ from foamfit.springs.compiled.contract import (
 )
 
 # Numbers that a run is given, after onsite damping and pace: velocity of a striker, tolerance,
-# bound on steps, length of a short implicit step, whether the contact is overdamped, least scales
-# of displacement, velocity, strain and stress.
-SPEED, TOL, MOST, BRIEFLY, OVER, LEAST = range(2, 8)
+# bound on steps, length of a short implicit step, whether the contact is overdamped, whether
+# implicit steps follow if there are too many, least scales of displacement, velocity, strain,
+# stress.
+SPEED, TOL, MOST, BRIEFLY, OVER, FOLLOWED, LEAST = range(2, 9)
 FIRST = 40.0  # first implicit step over a short one
 FADES = 5.0  # longest explicit step over a relaxation time; steps are stable up to 6.3
+TRIED, BEYOND = 500, 4.0  # steps, and expected steps over their bound, that end a hopeless run
 STOPPED = 0.1  # most of the velocity that a first step takes
 # Results of a run; after them, for each derivative, whether it is one-sided.
 OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST, STRESS_LOST = range(
@@ -281,13 +281,21 @@ def _advance(c, how, struck, want):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _failure(c, how, most):  # type: ignore[no-untyped-def]
+def _is_hopeless(c, most):  # type: ignore[no-untyped-def]
+    """Whether a run along a drive would take far too many steps, by those so far."""
+    r, t, last = c.now, c.time, c.samples - 1
+    share = (r.begun + r.now - t[0]) / (t[last] - t[0])
+    return r.taken > TRIED and r.taken > BEYOND * most * share
+
+
+@inner
+def _failure(c, how, most, gives_up):  # type: ignore[no-untyped-def]
     """Return how a run ends after a step: DONE if it goes on."""
     if c.drive.flat > 0.0:
         return c.none + FLAT_UNDER_STRESS
     if how == FAILED and not abs(c.new[0]) < math.inf:
         return c.none + NOT_FINITE
-    if c.now.taken >= most:
+    if c.now.taken >= most or (gives_up and _is_hopeless(c, most)):
         return c.none + TOO_MANY_STEPS
     return c.none + (STEP_UNDERFLOW if how == FAILED else DONE)
 
@@ -316,13 +324,14 @@ def integrate(  # type: ignore[no-untyped-def]
         done = drive(c, 1, want)
         r.step = r.horizon
     outcome, ended, longest = DONE, math.nan, _longest(c, want)
+    gives_up = reals[FOLLOWED] > 0.0 and not struck
     while not (done or (struck and int(r.sample) == c.samples)):
         _fresh_scales(c)
         keep_values(c)
         r.step = min(r.step, r.horizon - r.now, longest)
         upto = c.time[int(r.sample)] if struck else math.inf
         how = take_step(c, want, tol, upto, most)
-        outcome = _failure(c, how, most)
+        outcome = _failure(c, how, most, gives_up)
         event = _advance(c, how, struck, want) if outcome == DONE else c.none
         stalled = stalled + 1 if event == STALLED else 0
         if stalled > 4 * c.count + 8:

@@ -43,6 +43,7 @@ GROUP = REAL(WHOLES_AT, WHOLE, REALS_AT, REALS_AT, WHOLE, REAL)
 #: of the strain rate, results
 INSIDE = types.void(WHOLES_AT, WHOLE, WHOLE, WHOLE, REALS_AT, REALS_AT, REALS_AT, REALS_AT)
 PART, FLOW, FRICTION, JUMP, PATH, LOSE, SHARE, LOSSES, BEGIN_RAMP, END_RAMP = range(10)
+ALL, IN_STEP = -1, -2  # instead of a group
 ONLY_DERIVATIVES = 2  # instead of 0 or 1 for `want`, where the values are known
 
 
@@ -266,10 +267,44 @@ def _accelerate(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
             df[p + j] -= of_drag[j] * v * per
 
 
+@inner
+def dense(c, n, x, out):  # type: ignore[no-untyped-def]
+    """Fill the state at the share x of the step."""
+    z, line, wide, y = 1.0 - x, c.line, c.wide, c.y
+    if c.degree:
+        for i in range(n):
+            value = 0.0
+            for q in range(c.degree - 1, -1, -1):
+                value = (value + line[q * wide + i]) * x
+            out[i] = y[i] + value
+        return
+    for i in range(n):
+        value = line[4 * wide + i] + z * (line[5 * wide + i] + x * line[6 * wide + i])
+        value = line[2 * wide + i] + z * (line[3 * wide + i] + x * value)
+        out[i] = y[i] + x * (line[i] + z * (line[wide + i] + x * value))
+
+
+@inner
+def _stress_of_momentum(c, x):  # type: ignore[no-untyped-def]
+    """Return the stress from the acceleration of the striker by an implicit step.
+
+    Where an overdamped contact ends, spring and dashpot carry opposite stresses whose sum has lost
+    its digits.
+    """
+    line, wide, rate = c.line, c.wide, 0.0
+    for q in range(c.degree - 1, -1, -1):
+        rate = rate * x + (q + 1) * line[q * wide + 1]
+    return c.drive.value - c.drive.dragged * c.state[1] - rate / c.now.step / c.per_mass[0]
+
+
 @cfunc(types.void(WHOLES_AT, REALS_AT, REALS_AT, WHOLE, REAL, WHOLE), **OPTIONS, cache=True)
 def _rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
-    """Fill the rates f of a state y, or only the values of one group."""
+    """Fill the rates f of a state y, or only the values of one group, or those in a step."""
     c = unpack(words)
+    share = at
+    if only == IN_STEP:
+        dense(c, c.base, share, y)
+        at = c.now.now + share * c.now.step
     for g in range(c.groups):
         if only >= 0 and g != only:
             continue
@@ -288,6 +323,8 @@ def _rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
             f[2 * g], f[2 * g + 1] = c.drive.top_speed, 0.0
         else:
             _accelerate(c, g, y, f, want, at)
+    if only == IN_STEP and c.drive.overdamped > 0.0 and c.groups == 1:
+        c.carried[0] = _stress_of_momentum(c, share)
 
 
 RATES = _rates.address
@@ -296,10 +333,16 @@ RATES = _rates.address
 @inlined
 def rates(c, y, f, want, at):  # type: ignore[no-untyped-def]
     """Fill the rates f of a state y (with derivatives if `want`), `at` a time since the piece."""
-    _call_rates(c.rates_at, c, y, f, want, at, -1)
+    _call_rates(c.rates_at, c, y, f, want, at, ALL)
 
 
 @inlined
 def rates_of(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
     """Fill the values of one group, as `rates` does."""
     _call_rates(c.rates_at, c, y, f, want, at, g)
+
+
+@inlined
+def look(c, x):  # type: ignore[no-untyped-def]
+    """Fill the values of all springs at the share x of the step."""
+    _call_rates(c.rates_at, c, c.state, c.f, 0, x, IN_STEP)

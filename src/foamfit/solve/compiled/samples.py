@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from numba import cfunc, types
 
-from foamfit.solve.compiled.events import dense
-from foamfit.solve.compiled.motion import rates_of
+from foamfit.solve.compiled.motion import dense, rates_of
 from foamfit.solve.compiled.run import BATCH, RECORD, numbers, spring, unpack
 from foamfit.solve.scene import FREE, MOTION
 from foamfit.springs.compiled.contract import (

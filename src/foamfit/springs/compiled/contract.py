@@ -83,7 +83,9 @@ EXPLICIT, BY_STRESS, INTERNAL = range(3)
 PATHS, DIRECTION = 2, 3
 BY_STRAIN, ALONG_A, ALONG_B, BY_RATE = range(1, 5)  # rows; the last has one number
 WANTED, DERIVED, AT_STRAIN, AT_RATE, ON_BRANCH, POINT = range(6)  # POINT: length without x
-OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
+OPTIONS: dict[str, Any] = {
+    "error_model": "numpy", "fastmath": {"contract"}, "no_rewrites": True,
+}  # fmt: skip
 _INSIDE: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 # Without reference counts, which take longer than the loops.
 inner = njit(**_INSIDE, _nrt=False)

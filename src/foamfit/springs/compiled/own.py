@@ -80,7 +80,12 @@ VALUES, ENDS, DOWN, UP = range(4)
 FORMULAS, KIND, COUNT, INSIDE, BOUNDED, DAMPS = range(OWN, OWN + 6)
 _CP = types.CPointer(types.complex128)
 _FORMULAS = WHOLE(_CP, WHOLE, WHOLE, _CP)
-_ALONE: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_ALONE: dict[str, Any] = {
+    **OPTIONS,
+    "no_rewrites": False,
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}
 _WITHIN: dict[str, Any] = {**_ALONE, "_nrt": False}
 FURTHEST, TRIALS = 1e12, 200  # largest strain, and trials, in the search for a strain
 
