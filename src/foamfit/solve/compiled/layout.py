@@ -139,7 +139,7 @@ def _functions(shape: Shape, integrated: bool, several: bool, internal: bool) ->
     """
     from foamfit.solve.compiled import events, motion
 
-    group = inside = step = drive = write = 0
+    group = inside = step = advance = drive = write = 0
     if several:
         from foamfit.solve.compiled import groups
 
@@ -149,9 +149,9 @@ def _functions(shape: Shape, integrated: bool, several: bool, internal: bool) ->
 
         inside = inner.INSIDE_AT
     if integrated:
-        from foamfit.solve.compiled import samples
+        from foamfit.solve.compiled import loop, samples
 
-        write = samples.WRITE
+        advance, write = loop.ADVANCE, samples.WRITE
         if shape.degree:
             from foamfit.solve.compiled import implicit
 
@@ -164,7 +164,7 @@ def _functions(shape: Shape, integrated: bool, several: bool, internal: bool) ->
         from foamfit.solve.compiled import drive as driven
 
         drive = driven.DRIVE
-    return motion.RATES, group, inside, events.CHANGE, step, drive, write
+    return motion.RATES, group, inside, events.CHANGE, step, advance, drive, write
 
 
 @lru_cache(maxsize=1024)

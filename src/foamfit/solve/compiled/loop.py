@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from numba import cfunc, njit
 
 from foamfit.solve.compiled.events import (
     DOUBTFUL,
@@ -30,6 +30,7 @@ from foamfit.solve.compiled.run import (
     begin_run,
     numbers,
     spring,
+    unpack,
 )
 from foamfit.solve.compiled.samples import approach, fly, write_inside
 from foamfit.solve.scene import DONE, FLAT_UNDER_STRESS, NOT_FINITE, STEP_UNDERFLOW, TOO_MANY_STEPS
@@ -41,6 +42,7 @@ from foamfit.springs.compiled.contract import (
     RELAX,
     RESULTS,
     WHOLE,
+    WHOLES_AT,
     calling,
     inlined,
     inner,
@@ -255,12 +257,13 @@ def _begin(c, reals, mass):  # type: ignore[no-untyped-def]
         approach(c, reals[SPEED])
 
 
-@inner
-def _advance(c, how, struck, want):  # type: ignore[no-untyped-def]
+@cfunc(WHOLE(WHOLES_AT, WHOLE, WHOLE, WHOLE), **OPTIONS, cache=True)
+def _advance(words, how, struck, want):  # type: ignore[no-untyped-def]
     """Go to the first event in the step or to its end, and write its samples.
 
     Return what happened: nothing, an event, the end of contact, or an event without any progress.
     """
+    c = unpack(words)
     r, share, who, kind = c.now, 1.0, -1, -1
     if how == DOUBTFUL:
         share, who, kind = first_event(c)
@@ -278,6 +281,10 @@ def _advance(c, how, struck, want):  # type: ignore[no-untyped-def]
         fly(c, slope)
         return RELEASED + c.none
     return (SWITCHED if moved else STALLED) + c.none
+
+
+ADVANCE = _advance.address
+_call_advance = calling(WHOLE, RECORD, WHOLE, WHOLE, WHOLE)
 
 
 @inner
@@ -310,7 +317,7 @@ def integrate(  # type: ignore[no-untyped-def]
     the switches; `ints` and `floats`, zeros, are the memory of the run.
     """
     c = begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals)
-    r, want, struck = c.now, int(c.p > 0), reals[SPEED] > 0.0
+    r, want, struck = c.now, int(c.p > 0), int(reals[SPEED] > 0.0)
     tol, most, stalled, done = reals[TOL], reals[MOST], 0, 0
     _begin(c, reals, mass)
     if struck:
@@ -332,7 +339,7 @@ def integrate(  # type: ignore[no-untyped-def]
         upto = c.time[int(r.sample)] if struck else math.inf
         how = take_step(c, want, tol, upto, most)
         outcome = _failure(c, how, most, gives_up)
-        event = _advance(c, how, struck, want) if outcome == DONE else c.none
+        event = _call_advance(c.advance_at, c, how, struck, want) if outcome == DONE else c.none
         stalled = stalled + 1 if event == STALLED else 0
         if stalled > 4 * c.count + 8:
             outcome = STEP_UNDERFLOW
