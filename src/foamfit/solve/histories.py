@@ -14,7 +14,7 @@ from foamfit.solve.compiled import along, loop, static
 from foamfit.solve.compiled.layout import Shape, lay_out
 from foamfit.solve.scene import DONE, MOTION, NO_SWITCHES, STRESS
 from foamfit.springs.compiled import compiled
-from foamfit.springs.compiled.contract import INTERNAL, Compiled
+from foamfit.springs.compiled.contract import FLOWS, INTERNAL, Compiled
 from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, Law
 
 _ONE = np.ones(1)
@@ -27,7 +27,7 @@ def _given(law: Law, row: Array, history: Array, top: int, out: Array) -> tuple[
     Time is the number of the sample; it stands still for the law.
     """
     row, made = row.copy(), compiled(law)
-    integrated = made.kind == INTERNAL and (made.flows or top == STRESS)
+    integrated = made.kind == INTERNAL and (made.flows == FLOWS or top == STRESS)
     row[0] = 0.0  # no dashpot
     shape = Shape((law,), 0, (1,), top, b"\0", b"", False, 0, not integrated)
     layout = lay_out(shape, integrated)

@@ -20,7 +20,7 @@ from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled
-from foamfit.springs.compiled.contract import INTERNAL, TINY, Compiled
+from foamfit.springs.compiled.contract import FLOWS, INTERNAL, STILL, TINY, Compiled
 from foamfit.springs.laws.record import MOVED, OWN_RELAXATION, Law
 from foamfit.springs.spring import as_samples
 
@@ -97,8 +97,8 @@ class Plan(NamedTuple):
     @property
     def moves_one(self) -> bool:
         """Whether responses have a derivative by the prescribed motion: those of one spring."""
-        alone = self.solver == CLOSED_FORM and self.top == scenes.MOTION and self.mass.size == 1
-        return alone and int(self.ends[-1]) == 1
+        alone = self.solver == CLOSED_FORM and self.top == scenes.MOTION and self.ends == (1,)
+        return alone and self.laws.made[0].flows == STILL
 
     def run(
         self,
@@ -117,7 +117,9 @@ class Plan(NamedTuple):
         derivatives; see `springs.parameters`. Raise SimulationError if the motion is not finite.
         """
         if self.solver == CLOSED_FORM:
-            return self._closed_form(rows, heights, rtol, everything, directions)
+            found = self._closed_form(rows, heights, rtol, everything, directions)
+            if found is not None:
+                return found
         drag = self.drag if drag is None else drag
         given = rows, heights, rtol, drag, directions, everything
         motion = self._integrated(*given, LOGGED if everything else 0)
@@ -302,8 +304,11 @@ class Plan(NamedTuple):
 
     def _closed_form(
         self, rows: Array, heights: Array, rtol: float, everything: bool, directions: Directions
-    ) -> Motion:
-        """Solve springs in static equilibrium under one stress, or one spring in known motion."""
+    ) -> Motion | None:
+        """Solve springs in static equilibrium under one stress, or one spring in known motion.
+
+        Return None if internal variables do not decay as `compiled.decay` requires.
+        """
         count, wanted, n = len(heights), len(directions) > 0, self.time.size
         alone = self.top == scenes.MOTION and count == 1
         shown = count if everything else 1
@@ -315,7 +320,8 @@ class Plan(NamedTuple):
             strain = self.values / heights
             samples = histories.at_samples(strain, MOVED in own)
             drive = self.mass, reals, strain, self.time
-            cache.timed(along.follow, *given, *drive, out, NO_SWITCHES, samples)
+            if cache.timed(along.follow, *given, *drive, out, NO_SWITCHES, samples):
+                return None
             out[0, 1], out[1:, 1] = self.values, 0.0
             dashpot = rows.item(0, 0), heights.item(0)
             histories.add_dashpot(out, self.time, strain, *dashpot, own, samples)
@@ -426,7 +432,8 @@ def plan(
         ends = (*(inside + 1).tolist(), count)
         masses = np.append(arrays.masses[inside] / chain.area, masses)
     alone = top == scenes.MOTION and count == 1
-    internal = any(one.kind == INTERNAL and (one.flows or not alone) for one in laws.made)
+    flowing = any(one.kind == INTERNAL for one in laws.made)
+    internal = flowing and not (alone and laws.made[0].flows < FLOWS)
     damped = dashpots or arrays.damped or top == scenes.VISCOUS or internal
     if arrays.heavy or above > 0.0:
         solver = SECOND_ORDER
@@ -438,7 +445,7 @@ def plan(
     most = MOST_WORK // count + 2 * time.size + 8 * count
     most = max(1, min(max_steps, most, MOST_SAMPLED // count))
     explicit = min(most, 20 * time.size + max(1000, MOST_EXPLICIT_WORK // count))
-    if internal:  # whose own rates no estimate knows; implicit steps are tried after a few
+    if flowing:  # whose own rates no estimate knows; implicit steps are tried after a few
         explicit = min(explicit, most // 4)
     drag, terms = chain.site_damping / chain.height, max(chain.relaxation)
     return Plan(

@@ -15,7 +15,7 @@ from numba import njit
 
 from foamfit.solve.compiled.events import change_branch
 from foamfit.solve.compiled.motion import PART, call_inside, evaluate
-from foamfit.solve.compiled.run import begin_run
+from foamfit.solve.compiled.run import RECORD, begin_run
 from foamfit.solve.compiled.samples import row_of
 from foamfit.springs.compiled.contract import (
     BY,
@@ -23,9 +23,14 @@ from foamfit.springs.compiled.contract import (
     BY_STRESS,
     INTERNAL,
     OPTIONS,
+    REAL,
+    REALS_AT,
     RELAX,
     RESULTS,
+    WHOLE,
+    WHOLES_AT,
     call_number,
+    calling,
     inner,
     past,
     start,
@@ -34,6 +39,13 @@ from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATI
 
 OF_STEP, TABLE = 6, 8  # columns of the table of a relaxation term, which begins with moments
 LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the middle adds
+LEAST_FADE = 1e-6  # least step with internal variables that decay
+SAME, TOO_LONG, UNFIT = range(
+    3
+)  # how a step of `decay` ends: UNFIT if the law needs another solver
+#: record, strain, time until then, tolerance, derivatives by a shift of the motion, results
+FADING = WHOLE(WHOLES_AT, REAL, REAL, REAL, REALS_AT, REALS_AT)
+call_fade = calling(WHOLE, RECORD, REAL, REAL, REAL, REALS_AT, REALS_AT)
 
 
 @inner
@@ -134,31 +146,42 @@ def sum_up(c, j):  # type: ignore[no-untyped-def]
 def step_to(c, part, h, m, seed, tol, weight):  # type: ignore[no-untyped-def]
     """Step to a strain of the branch within h; false, unchanged, if the step is too long.
 
-    m: largest stress, tables, and room for the derivatives at the start and in the middle.
+    m: largest stress, share of the interval (negative if the law needs another solver), tables,
+    derivatives at the start, results of `decay` or derivatives in the middle.
     """
     s, p = c.springs, c.p
-    tables, d_first, d_middle = (
-        past(m, 2),
-        past(m, 2 + c.terms * TABLE),
-        past(m, 2 + c.terms * TABLE + p),
-    )
+    tables, d_first = past(m, 2), past(m, 2 + c.terms * TABLE)
+    room, fades = past(d_first, p), c.fade_at and c.drive.pace > 0.0
+    d_middle = past(room, 3)
     origin, first, slope, x = s.eps, s.sigma, s.slope, s.x
     step = part - origin
     for j in range(p):
         d_first[j] = c.common[j]
-    if c.terms == 0 or h <= 0.0:
+    if h <= 0.0 or (c.terms == 0 and not fades):
         m[0] = max(m[0], abs(bring_to(c, part)))
         derive(c, seed)
         return True
-    half = bring_to(c, origin + 0.5 * step)
-    derive(c, seed)
-    for j in range(p):
-        d_middle[j] = c.common[j]
-    last = bring_to(c, part)
-    low, high = slope * step, s.slope * step
+    if fades:
+        told = call_fade(c.fade_at, c, part, h, tol, seed, room)
+        if told == TOO_LONG and m[1] > LEAST_FADE:
+            return False
+        if told != SAME:
+            m[0], m[1] = math.inf, -1.0
+            return True
+        half, low, high, last = room[0], room[1], room[2], s.sigma
+    else:
+        half = bring_to(c, origin + 0.5 * step)
+        derive(c, seed)
+        for j in range(p):
+            d_middle[j] = c.common[j]
+        last = bring_to(c, part)
+        low, high = slope * step, s.slope * step
     bump = half - (0.5 * (first + last) + 0.125 * (low - high))
     size = max(m[0], abs(last))
     if FOLLOWED * weight * abs(bump) > tol * size and m[1] > LEAST_STEP:
+        if fades:
+            call_fade(c.fade_at, c, origin, -1.0, tol, seed, room)
+            return False
         s.eps, s.x = origin, x
         bring_to(c, origin)
         for j in range(p):
@@ -223,7 +246,7 @@ def follow(  # type: ignore[no-untyped-def]
     """Follow one spring, without its dashpot, along strains from rest.
 
     `samples` (n, 4) are derivatives by a shift of the motion, see `histories.at_samples`, then
-    branch and slope dσ/dε, which are filled.
+    branch and slope dσ/dε, which are filled. Return whether the law needs another solver.
     """
     c = begin_run(template, ints, floats, time, strains, out, log, rows, heights, mass, reals)
     s, t, tol, n, weight, m = c.springs, c.time, reals[3], c.samples, 0.0, c.batch
@@ -233,6 +256,8 @@ def follow(  # type: ignore[no-untyped-def]
         m[2 + k * TABLE + OF_STEP] = -1.0
     bring_to(c, 0.0)
     derive(c, start(samples))
+    if c.fade_at:
+        call_fade(c.fade_at, c, 0.0, 0.0, tol, start(samples), m)
     for j in range(n):
         seed, eps = past(start(samples), 4 * j), c.values[j]
         go_to(c, eps, t[j] - t[j - 1] if j > 0 else 0.0, m, seed, tol, weight)
@@ -245,4 +270,5 @@ def follow(  # type: ignore[no-untyped-def]
         if not m[0] < math.inf:
             for k in range(j, n):
                 out[0, 0, k], samples[k, 2] = math.inf, s.branch
-            return
+            return m[1] < 0.0
+    return False

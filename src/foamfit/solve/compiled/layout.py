@@ -28,6 +28,7 @@ from foamfit.springs.compiled import compiled
 from foamfit.springs.compiled.contract import (
     BY,
     BY_STRESS,
+    FADES,
     INTERNAL,
     MOST_TERMS,
     RESULTS,
@@ -132,14 +133,16 @@ def _owned(count: int, directions: list[list[int]]) -> list[int]:
     return [*first, count + 1 + len(listed), *listed]
 
 
-def _functions(shape: Shape, integrated: bool, several: bool, internal: bool) -> tuple[int, ...]:
+def _functions(
+    shape: Shape, integrated: bool, several: bool, internal: bool, fades: bool
+) -> tuple[int, ...]:
     """Return the addresses of the functions that a run needs, 0 for others (see run.ADDRESSES).
 
     A function is compiled when its module is first imported.
     """
     from foamfit.solve.compiled import events, motion
 
-    group = inside = step = advance = drive = write = 0
+    group = inside = step = advance = drive = write = fade = 0
     if several:
         from foamfit.solve.compiled import groups
 
@@ -148,6 +151,10 @@ def _functions(shape: Shape, integrated: bool, several: bool, internal: bool) ->
         from foamfit.solve.compiled import internal as inner
 
         inside = inner.INSIDE_AT
+    if fades:
+        from foamfit.solve.compiled import decay
+
+        fade = decay.FADE
     if integrated:
         from foamfit.solve.compiled import loop, samples
 
@@ -164,7 +171,7 @@ def _functions(shape: Shape, integrated: bool, several: bool, internal: bool) ->
         from foamfit.solve.compiled import drive as driven
 
         drive = driven.DRIVE
-    return motion.RATES, group, inside, events.CHANGE, step, advance, drive, write
+    return motion.RATES, group, inside, events.CHANGE, step, advance, drive, write, fade
 
 
 @lru_cache(maxsize=1024)
@@ -189,6 +196,9 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     size = carries if shape.degree else 0
     parameters = max(one.derivatives for one in made)
     internal = any(one.kind == INTERNAL for one in made)
+    fades = 0  # length of the memory of `decay`
+    if not integrated and made[0].flows == FADES:
+        fades = made[0].internal * (11 + 2 * 8 + 4 * p)
     lengths = {
         "springs": count * width, "per_mass": groups, "drive": len(DRIVE), "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
@@ -196,8 +206,8 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
         "scales": SCALES + count + 2 * nodes + internals,
         "now": len(NOW), "sided": p, "stage": STAGES * wide, "line": LINE * wide, "y": wide,
         "new": wide, "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
-        "batch": BATCH * (6 + BY + parameters) + 2 * p + 8 * MOST_TERMS,
-        "aside": count * (1 + shape.terms) + groups + 1 if internal else 0,
+        "batch": BATCH * (6 + BY + parameters) + 2 * p + 8 * MOST_TERMS + 8,
+        "aside": fades or (count * (1 + shape.terms) + groups + 1 if internal else 0),
         "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,
         "largest": p if size else 0, "kept": count * width + groups if size and p else 0,
         "systems": 2 * SYSTEMS * size * (3 * reach + 1),
@@ -213,7 +223,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     several = several or shape.top in (STRESS, VISCOUS)
     words = [
         *at[:-1], *whole[:-1], *([0] * len(GIVEN)),
-        *_functions(shape, integrated, several, internal),
+        *_functions(shape, integrated, several, internal, fades > 0),
         row, width, count, groups, nodes, p, base, carries, shape.terms, shape.top,
         int(shape.solved), wide, shape.degree, reach, 0, 0, 0, 0,
     ]  # fmt: skip

@@ -73,6 +73,7 @@ ADDRESSES = (
     "advance_at",
     "drive_at",
     "write_at",
+    "fade_at",
 )
 # Place of the row of a law in a block; width of a block; springs; groups; nodes
 # with a state; derivatives; components of the state before the derivatives, if all are integrated,

@@ -82,6 +82,7 @@ EXPLICIT, BY_STRESS, INTERNAL = range(3)
 # of `switch`; and for each direction of the solver its derivatives and dx.
 PATHS, DIRECTION = 2, 3
 BY_STRAIN, ALONG_A, ALONG_B, BY_RATE = range(1, 5)  # rows; the last has one number
+STILL, FADES, FLOWS = range(3)  # internal variables and V: nothing, x decays, or anything else
 WANTED, DERIVED, AT_STRAIN, AT_RATE, ON_BRANCH, POINT = range(6)  # POINT: length without x
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy", "fastmath": {"contract"}, "no_rewrites": True,
@@ -170,7 +171,7 @@ class Compiled(NamedTuple):
     slopes: tuple[int, ...] = ()
     pole: int = -1  #: column of the row with ε_*, if the strain stays below 1 + ε_*
     damps: bool = False  #: whether V depends on the strain rate
-    flows: bool = False  #: whether internal variables change within a branch, or V is not zero
+    flows: int = 0  #: how the state changes within a branch: STILL, FADES or FLOWS
 
 
 EVALUATE = 1  #: place among the addresses

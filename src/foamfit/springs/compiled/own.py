@@ -33,6 +33,8 @@ from foamfit.springs.compiled.contract import (
     EPS,
     EVALUATE,
     EXPLICIT,
+    FADES,
+    FLOWS,
     INTERNAL,
     MISS,
     OF_LAW,
@@ -46,6 +48,7 @@ from foamfit.springs.compiled.contract import (
     RESULTS,
     SLOPE,
     SPRING,
+    STILL,
     WANTED,
     WHOLE,
     Compiled,
@@ -465,7 +468,9 @@ def compile_law(law: Law) -> Compiled:
     # parameters, slope at rest, then room for complex numbers
     columns = count + 1 + 2 * (2 + inside + count + max(3, 2 + 2 * inside))
     fill = _fill(given.admissible, count, addresses, RESULTS + results_of(count, inside))
-    flows = kind == INTERNAL and bool(given.along or given.decay or given.viscous)
+    flows = FLOWS if given.along or given.viscous else FADES if given.decay else STILL
+    if flows == FADES and (given.ends or given.switch):
+        flows = FLOWS
     return Compiled(fill, kind, columns, count, inside, addresses, (count,), -1, damps > 0.0, flows)
 
 
