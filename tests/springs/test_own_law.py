@@ -255,6 +255,78 @@ def test_relaxation_begins_at_zero_at_any_strain(bouc_wen: Law) -> None:
 PLATEAU = ("loading", "plateau")
 
 
+def _prony(p, x, strain, branch):  # type: ignore[no-untyped-def]
+    elastic = p[0] * strain / (1.0 - strain)
+    total = elastic
+    for k in range(len(x)):
+        total += p[1 + k] * (elastic + x[k])
+    return total
+
+
+def _fading(p, x, strain, branch, out):  # type: ignore[no-untyped-def]
+    for k in range(len(x)):
+        out[k] = -(p[0] * strain / (1.0 - strain) + x[k]) / p[1 + len(x) + k]
+
+
+@functools.cache
+def prony(terms: int) -> Law:
+    """A curve with terms of a Prony series as internal variables."""
+    names = ["k", *(f"s{k}" for k in range(terms)), *(f"t{k}" for k in range(terms))]
+    law = ff.Law(
+        kind=f"prony-{terms}", params=tuple(ff.Param(name) for name in names), internal=terms,
+        functions=ff.Functions(_prony, decay=_fading if terms else None),
+    )  # fmt: skip
+    return ff.register(law)
+
+
+@pytest.mark.parametrize("taken", [1, 2, 3])
+def test_variables_that_decay_are_as_exact_as_relaxation(bouc_wen: Law, taken: int) -> None:
+    """Of three terms, the fastest a millionth of the test, some are internal variables."""
+    terms = [(0.3, 1e-6), (0.5, 0.02), (0.2, 0.7)]
+    time = np.linspace(0.0, 1.0, 301)
+    drive = ff.DisplacementDrive(HEIGHT * 0.4 * np.sin(3.0 * time) ** 2)
+    want = ff.simulate(
+        chain_of(prony(0).make([2e6, 0.0], terms)), drive, time, 1e-8,
+        sensitivities=["s1_k", "s1_g1", "s1_tau1", "s1_g2", "s1_tau2", "s1_height"],
+    )  # fmt: skip
+    strengths, times = zip(*terms[:taken], strict=True)
+    spring = prony(taken).make([2e6, *strengths, *times, 0.0], terms[taken:])
+    names = {"s1_k": "s1_k", "s1_g1": "s1_s0", "s1_tau1": "s1_t0", "s1_height": "s1_height"}
+    if taken > 1:
+        names |= {"s1_g2": "s1_s1", "s1_tau2": "s1_t1"}
+    got = ff.simulate(chain_of(spring), drive, time, 1e-8, sensitivities=list(names.values()))
+    assert got.method == want.method == "closed form"
+    assert np.abs(got.base_stress - want.base_stress).max() < 1e-8 * want.base_stress.max()
+    for known, own in names.items():
+        one, other = (r.sensitivities[n].base_stress for r, n in ((got, own), (want, known)))
+        assert np.abs(one - other).max() < 2e-5 * np.abs(other).max(), known
+
+
+def _creeping(p, x, strain, branch):  # type: ignore[no-untyped-def]
+    return p[0] * (strain - x[0])
+
+
+def _creep(p, x, strain, branch, out):  # type: ignore[no-untyped-def]
+    out[0] = p[1] * (strain - x[0]) ** 3
+
+
+def test_a_nonlinear_decay_is_integrated_in_time(bouc_wen: Law) -> None:
+    law = ff.register(ff.Law(
+        kind="creep", params=(ff.Param("k"), ff.Param("c")), internal=1,
+        functions=ff.Functions(_creeping, decay=_creep),
+    ))  # fmt: skip
+    time = np.linspace(0.0, 1.0, 201)
+    strain = 0.3 * time
+    got = ff.simulate(
+        chain_of(law.make([1e6, 4e3, 0.0], ())), ff.DisplacementDrive(HEIGHT * strain), time, 1e-8
+    )
+    found = solve_ivp(lambda t, x: 4e3 * (0.3 * t - x) ** 3, (0.0, 1.0), [0.0], t_eval=time,
+                      rtol=1e-11, atol=1e-14)  # fmt: skip
+    want = 1e6 * (strain - found.y[0])
+    assert got.method == "Dormand-Prince"
+    assert np.abs(got.base_stress - want).max() < 1e-8 * want.max()
+
+
 def _bent(p, x, strain, branch):  # type: ignore[no-untyped-def]
     return p[0] * strain if branch == 0 else 0.1 * p[0] + p[1] * (strain - 0.1)
 
