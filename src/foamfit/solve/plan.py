@@ -171,7 +171,7 @@ class Plan(NamedTuple):
     ) -> Motion:  # fmt: skip
         """Integrate in time and log the switches, if there is room."""
         stiff = bool(self.implicit)
-        if self.implicit is None and (drag or len(self.ends) > 1 or rows[:, 0].any()):
+        if self.implicit is None and (drag or len(self.ends) > 1 or any(rows[:, 0].tolist())):
             vibrates, relaxes = self.fastest_rates(rows, heights, drag)
             stiff = vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION
         shown = len(heights) if everything else 1
@@ -189,9 +189,10 @@ class Plan(NamedTuple):
             reals = self._reals(rows, heights, rtol, drag, degree)
             reals[loop.FOLLOWED] = degree == 0 and methods[-1] > 0
             self._integrate(*given, reals, degree)
-            if endings[loop.OUTCOME] not in _STIFF:
+            outcome = endings.item(loop.OUTCOME)
+            if outcome not in _STIFF:
                 break
-        if endings[loop.OUTCOME] == scenes.STEP_UNDERFLOW:
+        if outcome == scenes.STEP_UNDERFLOW:
             fastest = max(self.fastest_rates(rows, heights, drag))
             endings[loop.OUTCOME] = scenes.TOO_FAST if fastest > FASTEST else scenes.STEP_UNDERFLOW
         lost = _lost(endings) if degree else 0.0
@@ -288,7 +289,7 @@ class Plan(NamedTuple):
         """Return the result of a run as a Motion; raise SimulationError if it failed."""
         outcome, time, steps, switches = endings[:4].tolist()
         loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
-        finite = outcome == scenes.DONE and bool(np.isfinite(out[0]).all())
+        finite = outcome == scenes.DONE and _is_finite(out[0])
         if not finite:
             outcome = int(outcome) if outcome != scenes.DONE else scenes.NOT_FINITE
             raise scenes.failure(outcome, self.top, self.values, loose, steps=int(steps), time=time)
@@ -330,7 +331,7 @@ class Plan(NamedTuple):
             history = np.empty((2, count, n))
             drive = self.mass, reals, self.values, self.time
             cache.timed(static.balance, *given, *drive, out, NO_SWITCHES, history)
-        fine = bool(np.isfinite(out[0]).all())
+        fine = _is_finite(out[0])
         if fine and self.top == scenes.MOTION and not alone:
             miss = np.abs(out[0, -1] - self.values).max()
             fine = miss <= AT_MOST * (self.height + np.abs(self.values).max())
@@ -363,6 +364,12 @@ class Plan(NamedTuple):
 def _memory(layout: Layout) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Return the words of a run, and memory for its integers and floats."""
     return layout.words, np.empty_like(layout.words), np.zeros(layout.floats)
+
+
+def _is_finite(one: Array) -> bool:
+    """Whether all numbers are finite; their squares show it faster, if they are not too large."""
+    flat = one.ravel()
+    return math.isfinite(flat @ flat) or bool(np.isfinite(flat).all())
 
 
 def _lost(endings: Array) -> float:
