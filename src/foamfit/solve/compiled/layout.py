@@ -142,7 +142,7 @@ def _functions(
     """
     from foamfit.solve.compiled import events, motion
 
-    group = inside = step = advance = drive = write = fade = 0
+    group = inside = step = advance = drive = write = fade = short = 0
     if several:
         from foamfit.solve.compiled import groups
 
@@ -171,7 +171,11 @@ def _functions(
         from foamfit.solve.compiled import drive as driven
 
         drive = driven.DRIVE
-    return motion.RATES, group, inside, events.CHANGE, step, advance, drive, write, fade
+        if not shape.degree:
+            from foamfit.solve.compiled import short as shorter
+
+            short = shorter.SHORT_STEP
+    return motion.RATES, group, inside, events.CHANGE, step, advance, drive, write, fade, short
 
 
 @lru_cache(maxsize=1024)
