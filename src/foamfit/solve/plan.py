@@ -289,7 +289,7 @@ class Plan(NamedTuple):
         """Return the result of a run as a Motion; raise SimulationError if it failed."""
         outcome, time, steps, switches = endings[:4].tolist()
         loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
-        finite = outcome == scenes.DONE and _is_finite(out[0])
+        finite = outcome == scenes.DONE and bool(np.isfinite(out[0]).all())
         if not finite:
             outcome = int(outcome) if outcome != scenes.DONE else scenes.NOT_FINITE
             raise scenes.failure(outcome, self.top, self.values, loose, steps=int(steps), time=time)
@@ -331,7 +331,7 @@ class Plan(NamedTuple):
             history = np.empty((2, count, n))
             drive = self.mass, reals, self.values, self.time
             cache.timed(static.balance, *given, *drive, out, NO_SWITCHES, history)
-        fine = _is_finite(out[0])
+        fine = bool(np.isfinite(out[0]).all())
         if fine and self.top == scenes.MOTION and not alone:
             miss = np.abs(out[0, -1] - self.values).max()
             fine = miss <= AT_MOST * (self.height + np.abs(self.values).max())
@@ -364,12 +364,6 @@ class Plan(NamedTuple):
 def _memory(layout: Layout) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Return the words of a run, and memory for its integers and floats."""
     return layout.words, np.empty_like(layout.words), np.zeros(layout.floats)
-
-
-def _is_finite(one: Array) -> bool:
-    """Whether all numbers are finite; their squares show it faster, if they are not too large."""
-    flat = one.ravel()
-    return math.isfinite(flat @ flat) or bool(np.isfinite(flat).all())
 
 
 def _lost(endings: Array) -> float:
