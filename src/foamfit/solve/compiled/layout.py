@@ -32,6 +32,7 @@ from foamfit.springs.compiled.contract import (
     INTERNAL,
     MOST_TERMS,
     RESULTS,
+    Compiled,
     results_of,
 )
 from foamfit.springs.laws.record import OWN_ETA, Law
@@ -178,6 +179,11 @@ def _functions(
     return motion.RATES, group, inside, events.CHANGE, step, advance, drive, write, fade, short
 
 
+def _memory_of_decay(one: Compiled, p: int) -> int:
+    """Return the length of the memory of `decay`, 0 if it is not needed."""
+    return one.internal * (11 + 2 * 8 + 4 * p) if one.flows == FADES else 0
+
+
 @lru_cache(maxsize=1024)
 def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     """Lay out a run; `integrated` is whether it takes steps in time."""
@@ -200,9 +206,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     size = carries if shape.degree else 0
     parameters = max(one.derivatives for one in made)
     internal = any(one.kind == INTERNAL for one in made)
-    fades = 0  # length of the memory of `decay`
-    if not integrated and made[0].flows == FADES:
-        fades = made[0].internal * (11 + 2 * 8 + 4 * p)
+    fades = 0 if integrated else _memory_of_decay(made[0], p)
     lengths = {
         "springs": count * width, "per_mass": groups, "drive": len(DRIVE), "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
