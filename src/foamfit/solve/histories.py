@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.solve import cache
 from foamfit.solve.compiled import along, loop, static
-from foamfit.solve.compiled.layout import Shape, lay_out
+from foamfit.solve.layout import Shape, lay_out
 from foamfit.solve.scene import DONE, MOTION, NO_SWITCHES, STRESS
 from foamfit.springs.compiled import compiled
 from foamfit.springs.compiled.contract import FLOWS, INTERNAL, Compiled

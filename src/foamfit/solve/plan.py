@@ -13,8 +13,8 @@ from foamfit.errors import InputError
 from foamfit.solve import cache, histories
 from foamfit.solve import scene as scenes
 from foamfit.solve.compiled import along, loop, rates, static
-from foamfit.solve.compiled.layout import Layout, Shape, lay_out
 from foamfit.solve.compiled.run import AT, POINTS
+from foamfit.solve.layout import Layout, Shape, lay_out
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
 from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion

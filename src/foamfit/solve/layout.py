@@ -171,11 +171,7 @@ def _functions(
     if integrated and not shape.struck:
         from foamfit.solve.compiled import drive as driven
 
-        drive = driven.DRIVE
-        if not shape.degree:
-            from foamfit.solve.compiled import short as shorter
-
-            short = shorter.SHORT_STEP
+        drive, short = driven.DRIVE, driven.SHORT_STEP
     return motion.RATES, group, inside, events.CHANGE, step, advance, drive, write, fade, short
 
 
