@@ -255,6 +255,102 @@ def test_relaxation_begins_at_zero_at_any_strain(bouc_wen: Law) -> None:
 PLATEAU = ("loading", "plateau")
 
 
+def _prony(p, x, strain, branch):  # type: ignore[no-untyped-def]
+    elastic = p[0] * strain / (1.0 - strain)
+    total = elastic
+    for k in range(len(x)):
+        total += p[1 + k] * (elastic + x[k])
+    return total
+
+
+def _fading(p, x, strain, branch, out):  # type: ignore[no-untyped-def]
+    for k in range(len(x)):
+        out[k] = -(p[0] * strain / (1.0 - strain) + x[k]) / p[1 + len(x) + k]
+
+
+@functools.cache
+def prony(terms: int, stepped: bool = False) -> Law:
+    """A curve with terms of a Prony series as internal variables; `stepped` forbids closed form."""
+    names = ["k", *(f"s{k}" for k in range(terms)), *(f"t{k}" for k in range(terms))]
+    given = ff.Functions(_prony, decay=_fading, viscous=_no_stress) if stepped else ff.Functions(
+        _prony, decay=_fading if terms else None
+    )  # fmt: skip
+    kind = f"prony-{terms}" + "-stepped" * stepped
+    params = tuple(ff.Param(name) for name in names)
+    return ff.register(ff.Law(kind=kind, params=params, internal=terms, functions=given))
+
+
+def _no_stress(p, x, strain, rate, branch):  # type: ignore[no-untyped-def]
+    return 0j
+
+
+def _agree(got: ff.Response, want: ff.Response, names: dict[str, str], bar: float) -> None:
+    """Stresses and derivatives agree; `names` are those of derivatives of both."""
+    assert np.abs(got.base_stress - want.base_stress).max() < bar * want.base_stress.max()
+    for own, other in names.items():
+        one, two = got.sensitivities[own].base_stress, want.sensitivities[other].base_stress
+        assert np.abs(one - two).max() < 2e-5 * np.abs(two).max(), own
+
+
+def test_variables_that_decay_are_as_exact_as_relaxation(bouc_wen: Law) -> None:
+    terms = [(0.3, 1e-6), (0.5, 0.02), (0.2, 0.7)]
+    time = np.linspace(0.0, 1.0, 301)
+    drive = ff.DisplacementDrive(HEIGHT * 0.4 * np.sin(3.0 * time) ** 2)
+    names = {"s1_k": "s1_k", "s1_height": "s1_height"}
+    for k in range(3):
+        names |= {f"s1_s{k}": f"s1_g{k + 1}", f"s1_t{k}": f"s1_tau{k + 1}"}
+    springs = (
+        prony(3).make([2e6, *np.transpose(terms).ravel(), 0.0], ()),
+        prony(0).make([2e6, 0.0], terms),
+    )
+    got, want = (
+        ff.simulate(chain_of(one), drive, time, 1e-8, sensitivities=list(wanted))
+        for one, wanted in zip(springs, (names, names.values()), strict=True)
+    )
+    assert got.method == want.method == "closed form"
+    _agree(got, want, names, 1e-12)
+
+
+def test_variables_that_decay_and_relaxation_agree_with_steps_in_time(bouc_wen: Law) -> None:
+    time = np.linspace(0.0, 1.0, 101)
+    drive = ff.DisplacementDrive(HEIGHT * (0.02 + 0.4 * np.sin(3.0 * time) ** 2))
+    values, names = [2e6, 0.3, 0.5, 0.003, 0.2, 0.0], ["s1_k", "s1_s0", "s1_t1", "s1_g1", "s1_tau1"]
+    got, want = (
+        ff.simulate(
+            chain_of(prony(2, stepped).make(values, [(0.4, 0.3)])), drive, time, 1e-9,
+            sensitivities=names,
+        )
+        for stepped in (False, True)
+    )  # fmt: skip
+    assert got.method == "closed form" != want.method
+    _agree(got, want, dict(zip(names, names, strict=True)), 1e-9)
+
+
+def _creeping(p, x, strain, branch):  # type: ignore[no-untyped-def]
+    return p[0] * (strain - x[0])
+
+
+def _creep(p, x, strain, branch, out):  # type: ignore[no-untyped-def]
+    out[0] = p[1] * (strain - x[0]) ** 3
+
+
+def test_a_nonlinear_decay_is_integrated_in_time(bouc_wen: Law) -> None:
+    law = ff.register(ff.Law(
+        kind="creep", params=(ff.Param("k"), ff.Param("c")), internal=1,
+        functions=ff.Functions(_creeping, decay=_creep),
+    ))  # fmt: skip
+    time = np.linspace(0.0, 1.0, 201)
+    strain = 0.3 * time
+    got = ff.simulate(
+        chain_of(law.make([1e6, 4e3, 0.0], ())), ff.DisplacementDrive(HEIGHT * strain), time, 1e-8
+    )
+    found = solve_ivp(lambda t, x: 4e3 * (0.3 * t - x) ** 3, (0.0, 1.0), [0.0], t_eval=time,
+                      rtol=1e-11, atol=1e-14)  # fmt: skip
+    want = 1e6 * (strain - found.y[0])
+    assert got.method == "Dormand-Prince"
+    assert np.abs(got.base_stress - want).max() < 1e-8 * want.max()
+
+
 def _bent(p, x, strain, branch):  # type: ignore[no-untyped-def]
     return p[0] * strain if branch == 0 else 0.1 * p[0] + p[1] * (strain - 0.1)
 

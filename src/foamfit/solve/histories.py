@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.solve import cache
 from foamfit.solve.compiled import along, loop, static
-from foamfit.solve.compiled.layout import Shape, lay_out
+from foamfit.solve.layout import Shape, lay_out
 from foamfit.solve.scene import DONE, MOTION, NO_SWITCHES, STRESS
 from foamfit.springs.compiled import compiled
-from foamfit.springs.compiled.contract import INTERNAL, Compiled
+from foamfit.springs.compiled.contract import FLOWS, INTERNAL, Compiled
 from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, Law
 
 _ONE = np.ones(1)
@@ -26,7 +26,8 @@ def _given(law: Law, row: Array, history: Array, top: int, out: Array) -> tuple[
 
     Time is the number of the sample; it stands still for the law.
     """
-    row, integrated = row.copy(), compiled(law).kind == INTERNAL
+    row, made = row.copy(), compiled(law)
+    integrated = made.kind == INTERNAL and (made.flows == FLOWS or top == STRESS)
     row[0] = 0.0  # no dashpot
     shape = Shape((law,), 0, (1,), top, b"\0", b"", False, 0, not integrated)
     layout = lay_out(shape, integrated)
@@ -34,7 +35,7 @@ def _given(law: Law, row: Array, history: Array, top: int, out: Array) -> tuple[
     scales = (most, np.abs(np.diff(history)).max(initial=0.0), most, 0.0)
     if top == STRESS:
         scales = 1e-3, 0.0, 1e-3, most
-    reals = np.array((0.0, 0.0, 0.0 if integrated else TOL, TOL, 1e9, 0.0, 0.0, *scales))
+    reals = np.array((0.0, 0.0, 0.0 if integrated else TOL, TOL, 1e9, 0.0, 0.0, 0.0, *scales))
     time = np.arange(history.size, dtype=float)
     memory = layout.words, np.empty_like(layout.words), np.zeros(layout.floats)
     return [*memory, row[None, :], _ONE, _ONE, reals, history, time, out], integrated

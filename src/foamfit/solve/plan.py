@@ -13,14 +13,14 @@ from foamfit.errors import InputError
 from foamfit.solve import cache, histories
 from foamfit.solve import scene as scenes
 from foamfit.solve.compiled import along, loop, rates, static
-from foamfit.solve.compiled.layout import Layout, Shape, lay_out
 from foamfit.solve.compiled.run import AT, POINTS
+from foamfit.solve.layout import Layout, Shape, lay_out
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
 from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled
-from foamfit.springs.compiled.contract import INTERNAL, TINY, Compiled
+from foamfit.springs.compiled.contract import FLOWS, INTERNAL, STILL, TINY, Compiled
 from foamfit.springs.laws.record import MOVED, OWN_RELAXATION, Law
 from foamfit.springs.spring import as_samples
 
@@ -97,8 +97,8 @@ class Plan(NamedTuple):
     @property
     def moves_one(self) -> bool:
         """Whether responses have a derivative by the prescribed motion: those of one spring."""
-        alone = self.solver == CLOSED_FORM and self.top == scenes.MOTION and self.mass.size == 1
-        return alone and int(self.ends[-1]) == 1
+        alone = self.solver == CLOSED_FORM and self.top == scenes.MOTION and self.ends == (1,)
+        return alone and self.laws.made[0].flows == STILL
 
     def run(
         self,
@@ -117,7 +117,9 @@ class Plan(NamedTuple):
         derivatives; see `springs.parameters`. Raise SimulationError if the motion is not finite.
         """
         if self.solver == CLOSED_FORM:
-            return self._closed_form(rows, heights, rtol, everything, directions)
+            found = self._closed_form(rows, heights, rtol, everything, directions)
+            if found is not None:
+                return found
         drag = self.drag if drag is None else drag
         given = rows, heights, rtol, drag, directions, everything
         motion = self._integrated(*given, LOGGED if everything else 0)
@@ -169,7 +171,7 @@ class Plan(NamedTuple):
     ) -> Motion:  # fmt: skip
         """Integrate in time and log the switches, if there is room."""
         stiff = bool(self.implicit)
-        if self.implicit is None and (drag or len(self.ends) > 1 or rows[:, 0].any()):
+        if self.implicit is None and (drag or len(self.ends) > 1 or any(rows[:, 0].tolist())):
             vibrates, relaxes = self.fastest_rates(rows, heights, drag)
             stiff = vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION
         shown = len(heights) if everything else 1
@@ -182,12 +184,15 @@ class Plan(NamedTuple):
             return found
         log, endings = np.empty((logged, 5)), np.empty(loop.ENDINGS + len(directions))
         given = rows, heights, directions, out, log, endings
-        for degree in self._methods(stiff):
+        methods = self._methods(stiff)
+        for degree in methods:
             reals = self._reals(rows, heights, rtol, drag, degree)
+            reals[loop.FOLLOWED] = degree == 0 and methods[-1] > 0
             self._integrate(*given, reals, degree)
-            if endings[loop.OUTCOME] not in _STIFF:
+            outcome = endings.item(loop.OUTCOME)
+            if outcome not in _STIFF:
                 break
-        if endings[loop.OUTCOME] == scenes.STEP_UNDERFLOW:
+        if outcome == scenes.STEP_UNDERFLOW:
             fastest = max(self.fastest_rates(rows, heights, drag))
             endings[loop.OUTCOME] = scenes.TOO_FAST if fastest > FASTEST else scenes.STEP_UNDERFLOW
         lost = _lost(endings) if degree else 0.0
@@ -224,7 +229,7 @@ class Plan(NamedTuple):
             first = self.slopes_of(rows)[0]
             over = rates.is_overdamped(first, rows[:, 0], heights, float(self.mass[-1]))
         scales = self._scales(rows, heights)
-        return np.array((drag, 1.0, self.speed, tol, most, brief, over, *scales))
+        return np.array((drag, 1.0, self.speed, tol, most, brief, over, 0.0, *scales))
 
     def _integrate(
         self, rows: Array, heights: Array, directions: Directions, out: Array, log: Array,
@@ -300,8 +305,11 @@ class Plan(NamedTuple):
 
     def _closed_form(
         self, rows: Array, heights: Array, rtol: float, everything: bool, directions: Directions
-    ) -> Motion:
-        """Solve springs in static equilibrium under one stress, or one spring in known motion."""
+    ) -> Motion | None:
+        """Solve springs in static equilibrium under one stress, or one spring in known motion.
+
+        Return None if internal variables do not decay as `compiled.decay` requires.
+        """
         count, wanted, n = len(heights), len(directions) > 0, self.time.size
         alone = self.top == scenes.MOTION and count == 1
         shown = count if everything else 1
@@ -313,7 +321,8 @@ class Plan(NamedTuple):
             strain = self.values / heights
             samples = histories.at_samples(strain, MOVED in own)
             drive = self.mass, reals, strain, self.time
-            cache.timed(along.follow, *given, *drive, out, NO_SWITCHES, samples)
+            if cache.timed(along.follow, *given, *drive, out, NO_SWITCHES, samples):
+                return None
             out[0, 1], out[1:, 1] = self.values, 0.0
             dashpot = rows.item(0, 0), heights.item(0)
             histories.add_dashpot(out, self.time, strain, *dashpot, own, samples)
@@ -423,8 +432,9 @@ def plan(
         inside = np.flatnonzero(arrays.masses[:-1] > 0.0)
         ends = (*(inside + 1).tolist(), count)
         masses = np.append(arrays.masses[inside] / chain.area, masses)
-    internal = any(one.kind == INTERNAL for one in laws.made)
     alone = top == scenes.MOTION and count == 1
+    flowing = any(one.kind == INTERNAL for one in laws.made)
+    internal = flowing and not (alone and laws.made[0].flows < FLOWS)
     damped = dashpots or arrays.damped or top == scenes.VISCOUS or internal
     if arrays.heavy or above > 0.0:
         solver = SECOND_ORDER
@@ -436,7 +446,7 @@ def plan(
     most = MOST_WORK // count + 2 * time.size + 8 * count
     most = max(1, min(max_steps, most, MOST_SAMPLED // count))
     explicit = min(most, 20 * time.size + max(1000, MOST_EXPLICIT_WORK // count))
-    if internal:  # whose own rates no estimate knows; implicit steps are tried after a few
+    if flowing:  # whose own rates no estimate knows; implicit steps are tried after a few
         explicit = min(explicit, most // 4)
     drag, terms = chain.site_damping / chain.height, max(chain.relaxation)
     return Plan(

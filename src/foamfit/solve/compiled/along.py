@@ -1,6 +1,7 @@
 """One spring under a known motion, without integration of the motion.
 
-The strain is linear between samples, so the stress needs no integration. Relaxation terms z = q/g -
+The strain is linear between samples, so the stress needs no integration, nor do internal variables
+that change only where a branch ends. Relaxation terms z = q/g -
 σ with dz/dt = -(z + σ)/τ are integrated exactly for the quartic through the stress at both ends and
 the middle of a step and its slopes at the ends; what the middle adds to the cubic is the error
 estimate. Derivatives follow from those of the stress at the same three points.
@@ -13,17 +14,23 @@ import math
 from numba import njit
 
 from foamfit.solve.compiled.events import change_branch
-from foamfit.solve.compiled.motion import evaluate
-from foamfit.solve.compiled.run import begin_run
+from foamfit.solve.compiled.motion import PART, call_inside, evaluate
+from foamfit.solve.compiled.run import RECORD, begin_run
 from foamfit.solve.compiled.samples import row_of
 from foamfit.springs.compiled.contract import (
     BY,
     BY_HELD,
     BY_STRESS,
+    INTERNAL,
     OPTIONS,
+    REAL,
+    REALS_AT,
     RELAX,
     RESULTS,
+    WHOLE,
+    WHOLES_AT,
     call_number,
+    calling,
     inner,
     past,
     start,
@@ -32,6 +39,13 @@ from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATI
 
 OF_STEP, TABLE = 6, 8  # columns of the table of a relaxation term, which begins with moments
 LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the middle adds
+LEAST_FADE = 1e-6  # least step with internal variables that decay
+SAME, TOO_LONG, UNFIT = range(
+    3
+)  # how a step of `decay` ends: UNFIT if the law needs another solver
+#: record, strain, time until then, tolerance, derivatives by a shift of the motion, results
+FADING = WHOLE(WHOLES_AT, REAL, REAL, REAL, REALS_AT, REALS_AT)
+call_fade = calling(WHOLE, RECORD, REAL, REAL, REAL, REALS_AT, REALS_AT)
 
 
 @inner
@@ -44,16 +58,19 @@ def bring_to(c, eps):  # type: ignore[no-untyped-def]
 
 
 @inner
-def derive(c, seed, y):  # type: ignore[no-untyped-def]
+def derive(c, seed):  # type: ignore[no-untyped-def]
     """Fill the derivatives of the stress now in `part`, and those of the strain."""
     s, n, p = c.springs, c.numbers, c.p
     out, held, part, strain = past(s, RESULTS), c.held, c.part, c.strain
+    if n.kind == INTERNAL:
+        call_inside(c, PART, c.none, c.none, c.y, c.y, c.y, part)
     for j in range(p):
         own = c.directions[2 * j + 1]
         strain[j] = s.per_height * (seed[0] + seed[1] * s.eps) if own == MOVED else 0.0
         if own == OWN_HEIGHT:
             strain[j] = -s.eps * s.per_height
-        part[j] = out[BY + own] if 0 <= own < OWN_ETA else 0.0
+        if n.kind != INTERNAL:
+            part[j] = out[BY + own] if 0 <= own < OWN_ETA else 0.0
         if n.kind == BY_STRESS:
             part[j] += out[BY_HELD] * held[j] + out[BY_HELD + 1] * held[p + j]
         c.common[j] = part[j] + s.slope * strain[j]
@@ -80,18 +97,18 @@ def tabulate(x, h, table):  # type: ignore[no-untyped-def]
 
 
 @inner
-def relax(c, h, tables, y, first, low, high, last, bump, d_first, d_middle):  # type: ignore[no-untyped-def]
+def relax(c, h, tables, first, low, high, last, bump, d_first, d_middle):  # type: ignore[no-untyped-def]
     """Advance the relaxation terms and their derivatives over a step.
 
     The stress goes from `first` to `last` with the slopes `low` and `high` at the ends, and `bump`
-    times 16 r² (1-r)². y contains the terms, then their derivatives.
+    times 16 r² (1-r)².
     """
-    s, p = c.springs, c.p
+    s, p, y = c.springs, c.p, c.y
     rise = last - first
     square, cube = 3.0 * rise - 2.0 * low - high, low + high - 2.0 * rise
     square, cube, fourth = square + 16.0 * bump, cube - 32.0 * bump, 16.0 * bump
     for k in range(c.terms):
-        tau, a, dz = s[RELAX + 2 * k + 1], past(tables, k * TABLE), past(y, c.terms + k * p)
+        tau, a, dz = s[RELAX + 2 * k + 1], past(tables, k * TABLE), past(y, c.base + k * p)
         x = h / tau
         decay = math.exp(-x)
         total = first * a[0] + low * a[1] + square * a[2] + cube * a[3] + fourth * a[4]
@@ -108,15 +125,15 @@ def relax(c, h, tables, y, first, low, high, last, bump, d_first, d_middle):  # 
 
 
 @inner
-def sum_up(c, y, j):  # type: ignore[no-untyped-def]
+def sum_up(c, j):  # type: ignore[no-untyped-def]
     """Write stress and derivatives of a sample, with all terms."""
-    s, p = c.springs, c.p
+    s, p, y = c.springs, c.p, c.y
     sigma = s.sigma
     total = sigma
     for q in range(p):
         slope = c.common[q]
         for k in range(c.terms):
-            slope += s[RELAX + 2 * k] * (c.common[q] + y[c.terms + k * p + q])
+            slope += s[RELAX + 2 * k] * (c.common[q] + y[c.base + k * p + q])
             if c.directions[2 * q + 1] == OWN_RELAXATION + 2 * k:
                 slope += sigma + y[k]
         row_of(c, 1 + q, c.none)[j] = slope
@@ -126,58 +143,77 @@ def sum_up(c, y, j):  # type: ignore[no-untyped-def]
 
 
 @inner
-def step_to(c, part, h, m, seed, y, tol, weight):  # type: ignore[no-untyped-def]
+def step_to(c, part, h, m, seed, tol, weight):  # type: ignore[no-untyped-def]
     """Step to a strain of the branch within h; false, unchanged, if the step is too long.
 
-    m: largest stress, tables, and room for the derivatives at the start and in the middle.
+    m: largest stress, share of the interval (negative if the law needs another solver), tables,
+    derivatives at the start, results of `decay` or derivatives in the middle.
     """
     s, p = c.springs, c.p
-    tables, d_first, d_middle = (
-        past(m, 2),
-        past(m, 2 + c.terms * TABLE),
-        past(m, 2 + c.terms * TABLE + p),
-    )
+    tables, d_first = past(m, 2), past(m, 2 + c.terms * TABLE)
+    room, fades = past(d_first, p), c.fade_at and c.drive.pace > 0.0
+    d_middle = past(room, 3)
     origin, first, slope, x = s.eps, s.sigma, s.slope, s.x
     step = part - origin
     for j in range(p):
         d_first[j] = c.common[j]
-    if c.terms == 0 or h <= 0.0:
+    if h <= 0.0 or (c.terms == 0 and not fades):
         m[0] = max(m[0], abs(bring_to(c, part)))
-        derive(c, seed, y)
+        derive(c, seed)
         return True
-    half = bring_to(c, origin + 0.5 * step)
-    derive(c, seed, y)
-    for j in range(p):
-        d_middle[j] = c.common[j]
-    last = bring_to(c, part)
-    low, high = slope * step, s.slope * step
+    if fades:
+        told = call_fade(c.fade_at, c, part, h, tol, seed, room)
+        if told == TOO_LONG and m[1] > LEAST_FADE:
+            return False
+        if told != SAME:
+            m[0], m[1] = math.inf, -1.0
+            return True
+        half, low, high, last = room[0], room[1], room[2], s.sigma
+    else:
+        half = bring_to(c, origin + 0.5 * step)
+        derive(c, seed)
+        for j in range(p):
+            d_middle[j] = c.common[j]
+        last = bring_to(c, part)
+        low, high = slope * step, s.slope * step
     bump = half - (0.5 * (first + last) + 0.125 * (low - high))
     size = max(m[0], abs(last))
     if FOLLOWED * weight * abs(bump) > tol * size and m[1] > LEAST_STEP:
+        if fades:
+            call_fade(c.fade_at, c, origin, -1.0, tol, seed, room)
+            return False
         s.eps, s.x = origin, x
         bring_to(c, origin)
         for j in range(p):
             c.common[j] = d_first[j]
         return False
     m[0] = size
-    derive(c, seed, y)
+    derive(c, seed)
     for k in range(c.terms):
         if abs(h - tables[k * TABLE + OF_STEP]) > 1e-13 * h:
             tabulate(h / s[RELAX + 2 * k + 1], h, past(tables, k * TABLE))
-    relax(c, h, tables, y, first, low, high, last, bump, d_first, d_middle)
+    relax(c, h, tables, first, low, high, last, bump, d_first, d_middle)
     return True
 
 
 @inner
-def go_to(c, eps, between, m, seed, y, tol, weight):  # type: ignore[no-untyped-def]
+def leave(c, up, seed):  # type: ignore[no-untyped-def]
+    """Change the branch; the strain may grow at any rate, as time does not count."""
+    s = c.springs
+    s.rate = 1.0 if up else -1.0
+    change_branch(c, c.none, int(up), c.y)
+    bring_to(c, s.eps)
+    derive(c, seed)
+
+
+@inner
+def go_to(c, eps, between, m, seed, tol, weight):  # type: ignore[no-untyped-def]
     """Go to the strain of the next sample, `between` later, from branch to branch."""
     s, begun, left, pace = c.springs, c.springs.eps, 1.0, 1.0
     while left > 0.0 or s.eps != eps:
         up = eps > s.eps
         if s.eps != eps and s.turns * (1.0 if up else -1.0) < 0.0:
-            change_branch(c, c.none, int(up), y)
-            bring_to(c, s.eps)
-            derive(c, seed, y)
+            leave(c, up, seed)
         goal, until, leaving = eps, 0.0, False
         if up and eps > s.high:
             goal, leaving = s.high, True
@@ -190,7 +226,7 @@ def go_to(c, eps, between, m, seed, y, tol, weight):  # type: ignore[no-untyped-
             part, whole = s.eps + pace / share * (goal - s.eps), False
             share = pace
         m[1] = share
-        if not step_to(c, part, share * between, m, seed, y, tol, weight):
+        if not step_to(c, part, share * between, m, seed, tol, weight):
             pace = 0.5 * share
             continue
         if not m[0] < math.inf:
@@ -198,21 +234,9 @@ def go_to(c, eps, between, m, seed, y, tol, weight):  # type: ignore[no-untyped-
         left = max(left - share, 0.0)
         pace = 1.0 if whole else 2.0 * share
         if leaving and whole:
-            change_branch(c, c.none, int(up), y)
-            bring_to(c, s.eps)
-            derive(c, seed, y)
+            leave(c, up, seed)
         elif whole and left == 0.0 and s.eps == eps:
             return
-
-
-@inner
-def _first(c, eps, m, seed, y, tol, weight):  # type: ignore[no-untyped-def]
-    """Go to the strain of the first sample, where relaxation terms carry nothing."""
-    go_to(c, eps, 0.0, m, seed, y, tol, weight)
-    for k in range(c.terms):
-        y[k] = -c.springs.sigma
-        for q in range(c.p):
-            y[c.terms + k * c.p + q] = -c.common[q]
 
 
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
@@ -222,26 +246,29 @@ def follow(  # type: ignore[no-untyped-def]
     """Follow one spring, without its dashpot, along strains from rest.
 
     `samples` (n, 4) are derivatives by a shift of the motion, see `histories.at_samples`, then
-    branch and slope dσ/dε, which are filled.
+    branch and slope dσ/dε, which are filled. Return whether the law needs another solver.
     """
     c = begin_run(template, ints, floats, time, strains, out, log, rows, heights, mass, reals)
     s, t, tol, n, weight, m = c.springs, c.time, reals[3], c.samples, 0.0, c.batch
-    y = past(m, 2 + c.terms * TABLE + 2 * c.p)
     lasts = t[n - 1] - t[0]
     for k in range(c.terms):
         weight += s[RELAX + 2 * k] * min(1.0, lasts / s[RELAX + 2 * k + 1])
         m[2 + k * TABLE + OF_STEP] = -1.0
     bring_to(c, 0.0)
-    derive(c, start(samples), y)
+    derive(c, start(samples))
+    if c.fade_at:
+        call_fade(c.fade_at, c, 0.0, 0.0, tol, start(samples), m)
     for j in range(n):
         seed, eps = past(start(samples), 4 * j), c.values[j]
-        if j == 0:
-            _first(c, eps, m, seed, y, tol, weight)
-        else:
-            go_to(c, eps, t[j] - t[j - 1], m, seed, y, tol, weight)
-        sum_up(c, y, j)
+        go_to(c, eps, t[j] - t[j - 1] if j > 0 else 0.0, m, seed, tol, weight)
+        for k in range(c.terms if j == 0 else c.none):  # they carry nothing yet
+            c.y[k] = -s.sigma
+            for q in range(c.p):
+                c.y[c.base + k * c.p + q] = -c.common[q]
+        sum_up(c, j)
         samples[j, 2], samples[j, 3] = s.branch, s.slope
         if not m[0] < math.inf:
             for k in range(j, n):
                 out[0, 0, k], samples[k, 2] = math.inf, s.branch
-            return
+            return m[1] < 0.0
+    return False

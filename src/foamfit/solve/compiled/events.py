@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from numba import cfunc, types
 
-from foamfit.solve.compiled.motion import JUMP, call_inside, rates
+from foamfit.solve.compiled.motion import JUMP, call_inside, look
 from foamfit.solve.compiled.run import RECORD, numbers, spring, unpack
 from foamfit.springs.compiled.contract import (
     BY,
@@ -93,45 +93,6 @@ def change_branch(c, i, up, y):  # type: ignore[no-untyped-def]
 
 
 # ---------------------------------------------------------------- along a step
-
-
-@inner
-def dense(c, n, x, out):  # type: ignore[no-untyped-def]
-    """Fill the state at the share x of the step."""
-    z, line, wide, y = 1.0 - x, c.line, c.wide, c.y
-    if c.degree:
-        for i in range(n):
-            value = 0.0
-            for q in range(c.degree - 1, -1, -1):
-                value = (value + line[q * wide + i]) * x
-            out[i] = y[i] + value
-        return
-    for i in range(n):
-        value = line[4 * wide + i] + z * (line[5 * wide + i] + x * line[6 * wide + i])
-        value = line[2 * wide + i] + z * (line[3 * wide + i] + x * value)
-        out[i] = y[i] + x * (line[i] + z * (line[wide + i] + x * value))
-
-
-@inner
-def _stress_of_momentum(c, x):  # type: ignore[no-untyped-def]
-    """Return the stress from the acceleration of the striker by an implicit step.
-
-    Where an overdamped contact ends, spring and dashpot carry opposite stresses whose sum has lost
-    its digits.
-    """
-    line, wide, rate = c.line, c.wide, 0.0
-    for q in range(c.degree - 1, -1, -1):
-        rate = rate * x + (q + 1) * line[q * wide + 1]
-    return c.drive.value - c.drive.dragged * c.state[1] - rate / c.now.step / c.per_mass[0]
-
-
-@inner
-def look(c, x):  # type: ignore[no-untyped-def]
-    """Fill the values of all springs at the share x of the step."""
-    dense(c, c.base, x, c.state)
-    rates(c, c.state, c.f, c.none, c.now.now + x * c.now.step)
-    if c.drive.overdamped > 0.0 and c.groups == 1:
-        c.carried[0] = _stress_of_momentum(c, x)
 
 
 @inner

@@ -4,9 +4,7 @@ Switches of branch and the end of contact are roots on the dense output, of orde
 computed only in steps that contain a sample or, by a look at both ends, may contain a switch. The
 error norm leaves the derivatives by parameters out.
 
-A drive is linear between two samples, so no step is longer. Where samples are close, the pair of
-Bogacki and Shampine of order 3(2) is accurate enough for such a step, with a third of the
-evaluations of the rates.
+A drive is linear between two samples, so no step is longer; see also `drive`.
 """
 
 from __future__ import annotations
@@ -29,8 +27,20 @@ from foamfit.solve.compiled.events import (
     suspicious,
 )
 from foamfit.solve.compiled.motion import rates
-from foamfit.solve.compiled.run import STEPPED, spring, unpack
-from foamfit.springs.compiled.contract import OPTIONS, RELAX, inner, past
+from foamfit.solve.compiled.run import RECORD, STEPPED, unpack
+from foamfit.springs.compiled.contract import (
+    OPTIONS,
+    REAL,
+    WHOLE,
+    WHOLES_AT,
+    calling,
+    inner,
+    past,
+)
+
+#: record, whether with derivatives, tolerance; returns 1 if the step was taken
+SHORTENING = WHOLE(WHOLES_AT, WHOLE, REAL)
+call_short = calling(WHOLE, RECORD, WHOLE, REAL)
 
 ALL_STAGES = 16  # those of a step and of the dense output
 _A = np.zeros((ALL_STAGES, ALL_STAGES))
@@ -58,12 +68,6 @@ WEIGHT = np.concatenate(
 )  # fmt: skip
 TIMES = pair.C[:ALL_STAGES]
 MIDWAY_STAGE = int(np.flatnonzero(TIMES == MIDDLE)[0])
-
-SHORT_TIMES = np.array((0.5, 0.75, 1.0))
-BETWEEN = (MIDDLE - SHORT_TIMES[0]) / (SHORT_TIMES[1] - SHORT_TIMES[0])
-# Its errors add up, as they are close to the estimate; those of order 8 are far below it.
-STRICT = 0.1
-PAUSE = 8  # steps without an attempt at order 3 after one that was not accurate
 
 LAST_TERM = 1e-3  # share of the last term of the dense output that counts as its error
 
@@ -112,32 +116,6 @@ def take(c, n, dt, at, want):  # type: ignore[no-untyped-def]
         )
         if s == MIDWAY_STAGE:
             keep_midway(c)
-
-
-@inner
-def take_short(c, n, dt, at, want, tol):  # type: ignore[no-untyped-def]
-    """Take a step of order 3 as `take` does; return its error over the tolerance."""
-    y, new, scales, errors, wide = c.y, c.new, c.scales, c.errors, c.wide
-    for i in range(c.count):
-        s = spring(c, i)
-        for k in range(c.terms):
-            if s[RELAX + 2 * k] > 0.0 and dt > s[RELAX + 2 * k + 1]:  # derivatives would grow
-                return math.inf
-    for q in range(3):
-        target, row = c.new if q == 2 else c.state, STEPPED if q == 2 else 1 + q
-        combine(c, n, SHORT + q, dt, y, target)
-        rates(c, target, past(c.stage, row * wide), want, at + SHORT_TIMES[q] * dt)
-        for i in range(c.count):
-            s = spring(c, i)
-            if q < 2:  # at MIDDLE, by a straight line between the stages
-                s.midway = s.rate if q == 0 else s.midway + BETWEEN * (s.rate - s.midway)
-    combine(c, c.base, SHORT + 3, dt, c.nil, errors)
-    total = 0.0
-    for i in range(c.base):
-        size = max(scales[c.kinds[i]], max(abs(y[i]), abs(new[i])))
-        if size > 0.0:
-            total += (errors[i] / (tol * size)) ** 2
-    return math.sqrt(total / c.base)
 
 
 @inner
@@ -191,14 +169,8 @@ def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
     """
     c = unpack(words)
     r, again, n = c.now, False, c.base + c.carries * c.p
-    if upto == math.inf and r.now == 0.0 and r.step == r.horizon and r.step > 0.0:
-        r.paused -= 1.0
-        if r.paused < 0.0:
-            error = take_short(c, n, r.step, r.now, want, tol)
-            if error <= STRICT and not suspicious(c, r.step):
-                r.taken, r.grow = r.taken + 1.0, 6.0
-                return PLAIN
-            r.paused = PAUSE
+    if c.short_at and call_short(c.short_at, c, want, tol):
+        return PLAIN + c.none
     while True:
         dt, at = r.step, r.now
         if r.now + dt == r.now or not dt > 0.0:

@@ -1,7 +1,7 @@
 """What only springs of INTERNAL laws need: derivatives, jumps, the stress V, starts of drives.
 
-The results of such a law, from BY + parameters on, are σ, V and the rates A, B of each internal
-variable; then their derivatives by ε, dε/dt, each internal variable and each parameter.
+The results of such a law are σ, V and the rates A, B of each internal variable, and their
+derivatives, see `compiled.contract`.
 
 The derivatives δx of internal variables need those of the strain rate. Where no state contains the
 strain these are unknown, and u = δx - A δε is integrated instead, the derivatives at fixed strain:
@@ -36,14 +36,25 @@ from foamfit.solve.compiled.motion import (
 from foamfit.solve.compiled.run import numbers, spring, unpack
 from foamfit.solve.scene import MOTION, VISCOUS
 from foamfit.springs.compiled.contract import (
+    ALONG_A,
+    ALONG_B,
     BY,
+    BY_RATE,
+    DERIVED,
+    DIRECTION,
+    EPS,
     INTERNAL,
     OPTIONS,
+    PATHS,
     RELAX,
     RESULTS,
     X,
+    call_evaluate,
     call_switch,
+    changes_of,
+    inlined,
     inner,
+    last_point,
     past,
 )
 from foamfit.springs.laws.record import OWN_ETA
@@ -53,17 +64,26 @@ ENOUGH = 2e-15  # relative change of a rate or stress that ends Newton's method
 RAMP = 1e-9  # time of a ramp to the first sample over the duration
 
 
+@inlined
+def values_of(c, i):  # type: ignore[no-untyped-def]
+    """Return the results of the law of a spring."""
+    return past(spring(c, i), RESULTS + BY)
+
+
+@inlined
+def toward(c, i, j):  # type: ignore[no-untyped-def]
+    """Return the derivatives of σ, V, A and B at fixed strain in a direction, and its dx."""
+    n, x = numbers(c, i), numbers(c, i).internals
+    changes = changes_of(values_of(c, i), x)
+    return past(changes, (x + 1) * (1 + x + n.parameters) + j * (2 + 3 * x))
+
+
 @inner
 def _path(c, i):  # type: ignore[no-untyped-def]
     """Fill dσ/dε along the path of the internal variables, and what their rates B add to dT/dt."""
-    s, n = spring(c, i), numbers(c, i)
-    x, values = n.internals, past(s, RESULTS + BY + n.parameters)
-    size, tangent, drift = 2 + 2 * x, s.slope, 0.0
-    for k in range(x):
-        by_x = values[size + (2 + k) * size]
-        tangent += by_x * values[2 + k]
-        drift += c.drive.pace * s.gain * by_x * values[2 + x + k]
-    s.tangent, s.drift = tangent, drift
+    s, values, size = spring(c, i), values_of(c, i), 2 + 2 * numbers(c, i).internals
+    s.tangent = s.slope + values[ALONG_A * size]
+    s.drift = c.drive.pace * s.gain * values[ALONG_B * size]
 
 
 # ---------------------------------------------------------------- derivatives
@@ -71,59 +91,54 @@ def _path(c, i):  # type: ignore[no-untyped-def]
 
 @inner
 def _part(c, i, y, part):  # type: ignore[no-untyped-def]
-    """Add the derivatives of the stress through the internal variables."""
-    s, n, p = spring(c, i), numbers(c, i), c.p
-    size = 2 + 2 * n.internals
-    for k in range(n.internals):
-        by_x = s[RESULTS + BY + n.parameters + size + (2 + k) * size]
-        d_x = past(y, c.base + (n.x_at + k) * p)
-        for j in range(p):
-            part[j] += by_x * d_x[j]
+    """Fill the derivatives at fixed strain, by direction, and those of the stress."""
+    s, n, p, x = spring(c, i), numbers(c, i), c.p, numbers(c, i).internals
+    evaluate(c, i, PATHS if n.fixed else 1)  # at the strain rate found since
+    last = last_point(values_of(c, i), x)
+    for j in range(p):
+        out, fresh = toward(c, i, j), last[DERIVED] == 0.0
+        change, own = past(out, 2 + 2 * x), c.directions[2 * j + 1]
+        for k in range(x):
+            value = y[c.base + (n.x_at + k) * p + j]
+            fresh = fresh or value != change[k]
+            change[k] = value
+        if fresh:
+            own = own if c.directions[2 * j] == i and 0 <= own < OWN_ETA else -1
+            row, at = past(s, c.row), past(s, EPS)
+            call_evaluate(n.evaluate, row, s, at, change, own, DIRECTION, out)
+        part[j] = out[0]
+    last[DERIVED] = 1.0
 
 
 @inner
-def _flow(c, i, y, f, quicker):  # type: ignore[no-untyped-def]
+def _flow(c, i, f, quicker):  # type: ignore[no-untyped-def]
     """Fill the rates of the derivatives of the internal variables."""
     s, n, p = spring(c, i), numbers(c, i), c.p
-    x, values, strain = n.internals, past(s, RESULTS + BY + n.parameters), past(c.strain, i * p)
+    x, values, strain = n.internals, values_of(c, i), past(c.strain, i * p)
     size, rate, pace, fixed = 2 + 2 * x, s.rate, c.drive.pace, n.fixed
-    by = past(values, size)
+    by, by_a, by_b = past(values, size), past(values, ALONG_A * size), past(values, ALONG_B * size)
     for k in range(x):
         a, b = 2 + k, 2 + x + k
         at, by_strain = c.base + (n.x_at + k) * p, pace * by[b]
         if fixed:
-            for m in range(x):
-                column = past(by, (2 + m) * size)
-                by_strain += pace * (column[b] * values[2 + m] - column[a] * values[2 + x + m])
+            by_strain += pace * (by_a[b] - by_b[a])
         else:
             by_strain += rate * by[a]
         for j in range(p):
-            f[at + j] = by_strain * strain[j] + (0.0 if fixed else values[a] * quicker[j])
-        for m in range(x):
-            column, d_x = past(by, (2 + m) * size), past(y, c.base + (n.x_at + m) * p)
-            for j in range(p):
-                f[at + j] += (rate * column[a] + pace * column[b]) * d_x[j]
-        for m in range(c.owned[i], c.owned[i + 1]):
-            j = c.owned[m]
-            column = past(by, (2 + x + c.directions[2 * j + 1]) * size)
-            f[at + j] += rate * column[a] + pace * column[b]
+            out = toward(c, i, j)
+            f[at + j] = by_strain * strain[j] + rate * out[a] + pace * out[b]
+            if not fixed:
+                f[at + j] += values[a] * quicker[j]
 
 
 @inner
-def _friction(c, i, y, quicker, out):  # type: ignore[no-untyped-def]
+def _friction(c, i, quicker, out):  # type: ignore[no-untyped-def]
     """Add the derivatives of the stress V."""
-    s, n, p = spring(c, i), numbers(c, i), c.p
-    strain, size, pace = past(c.strain, i * p), 2 + 2 * n.internals, c.drive.pace
-    by = past(s, RESULTS + BY + n.parameters + size)
+    values, size, p = values_of(c, i), 2 + 2 * numbers(c, i).internals, c.p
+    strain, by_strain, by_rate = past(c.strain, i * p), values[size + 1], values[BY_RATE * size]
     for j in range(p):
-        out[j] += pace * (by[1] * strain[j] + by[size + 1] * quicker[j])
-    for k in range(n.internals):
-        d_x = past(y, c.base + (n.x_at + k) * p)
-        for j in range(p):
-            out[j] += pace * by[(2 + k) * size + 1] * d_x[j]
-    for m in range(c.owned[i], c.owned[i + 1]):
-        j = c.owned[m]
-        out[j] += pace * by[(2 + n.internals + c.directions[2 * j + 1]) * size + 1]
+        by_x = toward(c, i, j)[1]
+        out[j] += c.drive.pace * (by_strain * strain[j] + by_rate * quicker[j] + by_x)
 
 
 @inner
@@ -134,7 +149,7 @@ def _jump(c, i, up, y):  # type: ignore[no-untyped-def]
     """
     s, n, p = spring(c, i), numbers(c, i), c.p
     x, pace = n.internals, c.drive.pace
-    changes = past(s, RESULTS + BY + n.parameters + 2 + 2 * x)  # instead of derivatives
+    changes, first = changes_of(values_of(c, i), x), past(values_of(c, i), 2)  # A, then B
     for k in range(x):
         s[X + k] = y[n.x_at + k]
     call_switch(n.switch, past(s, c.row), s, up, changes)
@@ -142,7 +157,7 @@ def _jump(c, i, up, y):  # type: ignore[no-untyped-def]
         y[n.x_at + k] = s[X + k]
     if p == 0:
         return
-    wide, first = 1 + x + n.parameters, past(s, RESULTS + BY + n.parameters + 2)  # A, then B
+    wide = 1 + x + n.parameters
     end, out = past(changes, x * wide), past(changes, (x + 1) * wide)
     faster = s.rate * (1.0 - end[0])  # of the strain past the end
     for k in range(x):
@@ -191,13 +206,13 @@ def _lose(c, i, common):  # type: ignore[no-untyped-def]
         s.rate = force / s.eta
         return
     sign, rate, low, high = 1.0 if force > 0.0 else -1.0, abs(s.rate), 0.0, math.inf
-    values = past(s, RESULTS + BY + n.parameters)
+    values = values_of(c, i)
     rate = rate if rate > 0.0 else 1.0
     for _ in range(200):
         s.rate = sign * rate if force != 0.0 else 0.0
-        evaluate(c, i, 2 + c.none)
+        evaluate(c, i, 1 + c.none)
         value = sign * (values[1] + s.eta * s.rate)
-        s.loss = s.eta + values[2 * (2 + 2 * n.internals) + 1]
+        s.loss = s.eta + values[BY_RATE * (2 + 2 * n.internals)]
         if force == 0.0:  # at rest, where the derivative of a power is infinite or zero
             s.loss = math.inf
             return
@@ -263,8 +278,7 @@ def _losses(c, i, y, out):  # type: ignore[no-untyped-def]
     p, at = c.p, numbers(c, i).eps_at
     for j in range(p):
         c.strain[i * p + j] = y[c.base + at * p + j]
-    evaluate(c, i, 1 + c.none)
-    _friction(c, i, y, past(c.common, c.groups * p), out)
+    _friction(c, i, past(c.common, c.groups * p), out)
 
 
 # ---------------------------------------------------------------- the start of a drive
@@ -320,7 +334,7 @@ def _end_ramp(c, want):  # type: ignore[no-untyped-def]
             for j in range(p):
                 y[c.base + n.eps_at * p + j] = strain[j]
         if n.fixed:
-            first, n.fixed = past(s, RESULTS + BY + n.parameters + 2), 0
+            first, n.fixed = past(values_of(c, i), 2), 0
             for k in range(n.internals if n.kind == INTERNAL else c.none):
                 for j in range(p):
                     y[c.base + (n.x_at + k) * p + j] += first[k] * strain[j]
@@ -333,9 +347,9 @@ def _inside(words, task, i, up, y, f, quicker, out):  # type: ignore[no-untyped-
     if task == PART:
         _part(c, i, y, out)
     elif task == FLOW:
-        _flow(c, i, y, f, quicker)
+        _flow(c, i, f, quicker)
     elif task == FRICTION:
-        _friction(c, i, y, quicker, out)
+        _friction(c, i, quicker, out)
     elif task == PATH:
         _path(c, i)
     elif task == LOSE:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from numba import cfunc, njit
 
 from foamfit.solve.compiled.events import (
     DOUBTFUL,
@@ -15,13 +15,11 @@ from foamfit.solve.compiled.events import (
     TOP_END,
     TURN,
     change_branch,
-    dense,
     first_event,
     keep_values,
-    look,
     take_step,
 )
-from foamfit.solve.compiled.motion import rates
+from foamfit.solve.compiled.motion import dense, look, rates
 from foamfit.solve.compiled.run import (
     OF_EPS,
     OF_V,
@@ -32,6 +30,7 @@ from foamfit.solve.compiled.run import (
     begin_run,
     numbers,
     spring,
+    unpack,
 )
 from foamfit.solve.compiled.samples import approach, fly, write_inside
 from foamfit.solve.scene import DONE, FLAT_UNDER_STRESS, NOT_FINITE, STEP_UNDERFLOW, TOO_MANY_STEPS
@@ -43,6 +42,7 @@ from foamfit.springs.compiled.contract import (
     RELAX,
     RESULTS,
     WHOLE,
+    WHOLES_AT,
     calling,
     inlined,
     inner,
@@ -50,11 +50,13 @@ from foamfit.springs.compiled.contract import (
 )
 
 # Numbers that a run is given, after onsite damping and pace: velocity of a striker, tolerance,
-# bound on steps, length of a short implicit step, whether the contact is overdamped, least scales
-# of displacement, velocity, strain and stress.
-SPEED, TOL, MOST, BRIEFLY, OVER, LEAST = range(2, 8)
+# bound on steps, length of a short implicit step, whether the contact is overdamped, whether
+# implicit steps follow if there are too many, least scales of displacement, velocity, strain,
+# stress.
+SPEED, TOL, MOST, BRIEFLY, OVER, FOLLOWED, LEAST = range(2, 9)
 FIRST = 40.0  # first implicit step over a short one
 FADES = 5.0  # longest explicit step over a relaxation time; steps are stable up to 6.3
+TRIED, BEYOND = 500, 4.0  # steps, and expected steps over their bound, that end a hopeless run
 STOPPED = 0.1  # most of the velocity that a first step takes
 # Results of a run; after them, for each derivative, whether it is one-sided.
 OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST, STRESS_LOST = range(
@@ -121,7 +123,7 @@ def _mend(c, y):  # type: ignore[no-untyped-def]
                     y[n.x_at] += longer * s.tangent
                 elif n.kind == INTERNAL:
                     for k in range(n.internals):
-                        y[n.x_at + k] += longer * s[RESULTS + BY + n.parameters + 2 + k]
+                        y[n.x_at + k] += longer * s[RESULTS + BY + 2 + k]
 
 
 @inner
@@ -255,12 +257,13 @@ def _begin(c, reals, mass):  # type: ignore[no-untyped-def]
         approach(c, reals[SPEED])
 
 
-@inner
-def _advance(c, how, struck, want):  # type: ignore[no-untyped-def]
+@cfunc(WHOLE(WHOLES_AT, WHOLE, WHOLE, WHOLE), **OPTIONS, cache=True)
+def _advance(words, how, struck, want):  # type: ignore[no-untyped-def]
     """Go to the first event in the step or to its end, and write its samples.
 
     Return what happened: nothing, an event, the end of contact, or an event without any progress.
     """
+    c = unpack(words)
     r, share, who, kind = c.now, 1.0, -1, -1
     if how == DOUBTFUL:
         share, who, kind = first_event(c)
@@ -280,14 +283,26 @@ def _advance(c, how, struck, want):  # type: ignore[no-untyped-def]
     return (SWITCHED if moved else STALLED) + c.none
 
 
+ADVANCE = _advance.address
+_call_advance = calling(WHOLE, RECORD, WHOLE, WHOLE, WHOLE)
+
+
 @inner
-def _failure(c, how, most):  # type: ignore[no-untyped-def]
+def _is_hopeless(c, most):  # type: ignore[no-untyped-def]
+    """Whether a run along a drive would take far too many steps, by those so far."""
+    r, t, last = c.now, c.time, c.samples - 1
+    share = (r.begun + r.now - t[0]) / (t[last] - t[0])
+    return r.taken > TRIED and r.taken > BEYOND * most * share
+
+
+@inner
+def _failure(c, how, most, gives_up):  # type: ignore[no-untyped-def]
     """Return how a run ends after a step: DONE if it goes on."""
     if c.drive.flat > 0.0:
         return c.none + FLAT_UNDER_STRESS
     if how == FAILED and not abs(c.new[0]) < math.inf:
         return c.none + NOT_FINITE
-    if c.now.taken >= most:
+    if c.now.taken >= most or (gives_up and _is_hopeless(c, most)):
         return c.none + TOO_MANY_STEPS
     return c.none + (STEP_UNDERFLOW if how == FAILED else DONE)
 
@@ -302,7 +317,7 @@ def integrate(  # type: ignore[no-untyped-def]
     the switches; `ints` and `floats`, zeros, are the memory of the run.
     """
     c = begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals)
-    r, want, struck = c.now, int(c.p > 0), reals[SPEED] > 0.0
+    r, want, struck = c.now, int(c.p > 0), int(reals[SPEED] > 0.0)
     tol, most, stalled, done = reals[TOL], reals[MOST], 0, 0
     _begin(c, reals, mass)
     if struck:
@@ -316,14 +331,15 @@ def integrate(  # type: ignore[no-untyped-def]
         done = drive(c, 1, want)
         r.step = r.horizon
     outcome, ended, longest = DONE, math.nan, _longest(c, want)
+    gives_up = reals[FOLLOWED] > 0.0 and not struck
     while not (done or (struck and int(r.sample) == c.samples)):
         _fresh_scales(c)
         keep_values(c)
         r.step = min(r.step, r.horizon - r.now, longest)
         upto = c.time[int(r.sample)] if struck else math.inf
         how = take_step(c, want, tol, upto, most)
-        outcome = _failure(c, how, most)
-        event = _advance(c, how, struck, want) if outcome == DONE else c.none
+        outcome = _failure(c, how, most, gives_up)
+        event = _call_advance(c.advance_at, c, how, struck, want) if outcome == DONE else c.none
         stalled = stalled + 1 if event == STALLED else 0
         if stalled > 4 * c.count + 8:
             outcome = STEP_UNDERFLOW

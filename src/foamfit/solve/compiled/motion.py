@@ -20,6 +20,7 @@ from foamfit.springs.compiled.contract import (
     EXPLICIT,
     INTERNAL,
     OPTIONS,
+    PATHS,
     REAL,
     REALS_AT,
     RELAX,
@@ -42,6 +43,7 @@ GROUP = REAL(WHOLES_AT, WHOLE, REALS_AT, REALS_AT, WHOLE, REAL)
 #: of the strain rate, results
 INSIDE = types.void(WHOLES_AT, WHOLE, WHOLE, WHOLE, REALS_AT, REALS_AT, REALS_AT, REALS_AT)
 PART, FLOW, FRICTION, JUMP, PATH, LOSE, SHARE, LOSSES, BEGIN_RAMP, END_RAMP = range(10)
+ALL, IN_STEP = -1, -2  # instead of a group
 ONLY_DERIVATIVES = 2  # instead of 0 or 1 for `want`, where the values are known
 
 
@@ -80,7 +82,7 @@ def follow_spring(c, i, eps, y, f, want):  # type: ignore[no-untyped-def]
         for k in range(n.internals):
             s[X + k] = y[n.x_at + k]
     s.eps = eps
-    evaluate(c, i, want if kind != INTERNAL or want else 2 * n.fixed)
+    evaluate(c, i, PATHS if n.fixed and kind == INTERNAL else want)
     sigma, tangent, drift = s.sigma, s.slope, 0.0
     if kind == INTERNAL and n.fixed:
         call_inside(c, PATH, i, c.none, y, f, y, y)
@@ -103,7 +105,7 @@ def move_inside(c, i, f):  # type: ignore[no-untyped-def]
     if n.kind == BY_STRESS and not c.solved:
         f[n.x_at] = s.slope * s.rate
     elif n.kind == INTERNAL:
-        x, values = n.internals, past(s, RESULTS + BY + n.parameters)
+        x, values = n.internals, past(s, RESULTS + BY)
         for k in range(x):
             f[n.x_at + k] = values[2 + k] * s.rate + c.drive.pace * values[2 + x + k]
 
@@ -121,10 +123,11 @@ def derive_spring(c, i, y):  # type: ignore[no-untyped-def]
         a, b, held = out[BY_HELD], out[BY_HELD + 1], past(c.held, 2 * i * p)
         for j in range(p):
             part[j] = a * held[j] + b * held[p + j]
-    elif n.kind == INTERNAL:
+    if n.kind == INTERNAL:
         call_inside(c, PART, i, c.none, y, y, y, part)
-    for k in range(owned[i], owned[i + 1]):
-        part[owned[k]] += out[BY + directions[2 * owned[k] + 1]]
+    else:
+        for k in range(owned[i], owned[i + 1]):
+            part[owned[k]] += out[BY + directions[2 * owned[k] + 1]]
     gain = s.gain
     for j in range(p):
         total[j] = gain * part[j]
@@ -212,7 +215,7 @@ def _follow_one(c, g, i, y, f, want, at):  # type: ignore[no-untyped-def]
     common = follow_spring(c, i, reach * s.per_height, y, f, want) + s.eta * rate
     move_inside(c, i, f)
     if n.kind == INTERNAL:
-        common += c.drive.pace * s[RESULTS + BY + n.parameters + 1]
+        common += c.drive.pace * s[RESULTS + BY + 1]
     c.carried[g] = common
     return common
 
@@ -264,10 +267,44 @@ def _accelerate(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
             df[p + j] -= of_drag[j] * v * per
 
 
+@inner
+def dense(c, n, x, out):  # type: ignore[no-untyped-def]
+    """Fill the state at the share x of the step."""
+    z, line, wide, y = 1.0 - x, c.line, c.wide, c.y
+    if c.degree:
+        for i in range(n):
+            value = 0.0
+            for q in range(c.degree - 1, -1, -1):
+                value = (value + line[q * wide + i]) * x
+            out[i] = y[i] + value
+        return
+    for i in range(n):
+        value = line[4 * wide + i] + z * (line[5 * wide + i] + x * line[6 * wide + i])
+        value = line[2 * wide + i] + z * (line[3 * wide + i] + x * value)
+        out[i] = y[i] + x * (line[i] + z * (line[wide + i] + x * value))
+
+
+@inner
+def _stress_of_momentum(c, x):  # type: ignore[no-untyped-def]
+    """Return the stress from the acceleration of the striker by an implicit step.
+
+    Where an overdamped contact ends, spring and dashpot carry opposite stresses whose sum has lost
+    its digits.
+    """
+    line, wide, rate = c.line, c.wide, 0.0
+    for q in range(c.degree - 1, -1, -1):
+        rate = rate * x + (q + 1) * line[q * wide + 1]
+    return c.drive.value - c.drive.dragged * c.state[1] - rate / c.now.step / c.per_mass[0]
+
+
 @cfunc(types.void(WHOLES_AT, REALS_AT, REALS_AT, WHOLE, REAL, WHOLE), **OPTIONS, cache=True)
 def _rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
-    """Fill the rates f of a state y, or only the values of one group."""
+    """Fill the rates f of a state y, or only the values of one group, or those in a step."""
     c = unpack(words)
+    share = at
+    if only == IN_STEP:
+        dense(c, c.base, share, y)
+        at = c.now.now + share * c.now.step
     for g in range(c.groups):
         if only >= 0 and g != only:
             continue
@@ -286,6 +323,8 @@ def _rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
             f[2 * g], f[2 * g + 1] = c.drive.top_speed, 0.0
         else:
             _accelerate(c, g, y, f, want, at)
+    if only == IN_STEP and c.drive.overdamped > 0.0 and c.groups == 1:
+        c.carried[0] = _stress_of_momentum(c, share)
 
 
 RATES = _rates.address
@@ -294,10 +333,16 @@ RATES = _rates.address
 @inlined
 def rates(c, y, f, want, at):  # type: ignore[no-untyped-def]
     """Fill the rates f of a state y (with derivatives if `want`), `at` a time since the piece."""
-    _call_rates(c.rates_at, c, y, f, want, at, -1)
+    _call_rates(c.rates_at, c, y, f, want, at, ALL)
 
 
 @inlined
 def rates_of(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
     """Fill the values of one group, as `rates` does."""
     _call_rates(c.rates_at, c, y, f, want, at, g)
+
+
+@inlined
+def look(c, x):  # type: ignore[no-untyped-def]
+    """Fill the values of all springs at the share x of the step."""
+    _call_rates(c.rates_at, c, c.state, c.f, 0, x, IN_STEP)

@@ -64,7 +64,10 @@ FLOATS = (
 # of the components in the systems, and their groups.
 INTEGERS = ("numbers", "ends", "directions", "owned", "kinds", "pivots", "places", "groups_of")
 GIVEN = ("time", "values", "out", "log")  # arrays of the caller
-ADDRESSES = ("rates_at", "group_at", "inside_at", "change_at", "step_at", "drive_at", "write_at")
+ADDRESSES = (
+    "rates_at", "group_at", "inside_at", "change_at", "step_at", "advance_at", "drive_at",
+    "write_at", "fade_at", "short_at",
+)  # fmt: skip
 # Place of the row of a law in a block; width of a block; springs; groups; nodes
 # with a state; derivatives; components of the state before the derivatives, if all are integrated,
 # and those that have derivatives; relaxation terms; top, see `solve.scene`; whether the rest of the

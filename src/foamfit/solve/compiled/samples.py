@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from numba import cfunc, types
 
-from foamfit.solve.compiled.events import dense
-from foamfit.solve.compiled.motion import rates_of
+from foamfit.solve.compiled.motion import dense, rates_of
 from foamfit.solve.compiled.run import BATCH, RECORD, numbers, spring, unpack
 from foamfit.solve.scene import FREE, MOTION
 from foamfit.springs.compiled.contract import (
@@ -202,14 +201,23 @@ def _write_inside(c, reached, want):  # type: ignore[no-untyped-def]
 
 
 @inner
+def _coast(c, row, first, last, since, place, speed, pull):  # type: ignore[no-untyped-def]
+    """Write samples of a uniformly accelerated motion."""
+    for k in range(first, last):
+        dt = c.time[k] - since
+        row[k] = place + (speed + 0.5 * pull * dt) * dt
+
+
+@inner
 def _approach(c, speed):  # type: ignore[no-untyped-def]
     """Write the samples before contact, when only the striker moves."""
-    done, motion, t, gravity = c.none, row_of(c, c.none, c.shown - 1), c.time, c.drive.gravity
-    while done < c.samples and t[done] < 0.0:
-        for row in range((1 + c.p) * c.shown):
-            c.out[row * c.samples + done] = 0.0
-        motion[done] = (speed + 0.5 * gravity * t[done]) * t[done]
+    done = c.none
+    while done < c.samples and c.time[done] < 0.0:
         done += 1
+    for row in range((1 + c.p) * c.shown):
+        quick = speed if row == c.shown - 1 else 0.0
+        pull = c.drive.gravity if row == c.shown - 1 else 0.0
+        _coast(c, past(c.out, row * c.samples), c.none, done, 0.0, 0.0, quick, pull)
     c.now.sample = done
 
 
@@ -219,13 +227,10 @@ def _fly(c, slope):  # type: ignore[no-untyped-def]
 
     The chain moves with the striker. Derivatives include the shift of the end of contact.
     """
-    p, y, now, t, top = c.p, c.y, c.now.now, c.time, c.groups - 1
-    gravity = c.drive.gravity
-    speed, pull, first = y[2 * top + 1], c.stage[2 * top + 1], int(c.now.sample)
+    p, y, now, top, gravity = c.p, c.y, c.now.now, c.groups - 1, c.drive.gravity
+    speed, pull, first = y[2 * top + 1], c.stage[2 * top + 1] - gravity, int(c.now.sample)
     for j in range(1 + p):
-        stress = row_of(c, j, c.none)
-        for k in range(first, c.samples):
-            stress[k] = 0.0
+        _coast(c, row_of(c, j, c.none), first, c.samples, now, 0.0, 0.0, 0.0)
     reach = past(c.common, (c.groups + 1) * p)
     for g in range(c.groups):
         place, quick = place_nodes(c, g, y, reach), y[2 * g - 1] if g > 0 else 0.0
@@ -239,15 +244,13 @@ def _fly(c, slope):  # type: ignore[no-untyped-def]
             if c.shown == 2 and i < c.count - 1:
                 continue
             node = 1 + i if c.shown > 2 else 1
-            motion = row_of(c, c.none, node)
-            for k in range(first, c.samples):
-                motion[k] = place + (speed + 0.5 * gravity * (t[k] - now)) * (t[k] - now)
-            for j in range(p):
-                late = -c.common[j] / slope if slope != 0.0 else 0.0
-                dv = y[c.base + (2 * top + 1) * p + j] + (pull - gravity) * late
-                at, motion = reach[j] + (quick - speed) * late, row_of(c, 1 + j, node)
-                for k in range(first, c.samples):
-                    motion[k] = at + dv * (t[k] - now)
+            for j in range(1 + p):
+                at, fast, more = place, speed, gravity
+                if j > 0:
+                    late = -c.common[j - 1] / slope if slope != 0.0 else 0.0
+                    fast = y[c.base + (2 * top + 1) * p + j - 1] + pull * late
+                    at, more = reach[j - 1] + (quick - speed) * late, 0.0
+                _coast(c, row_of(c, j, node), first, c.samples, now, at, fast, more)
 
 
 # ---------------------------------------------------------------- called by address

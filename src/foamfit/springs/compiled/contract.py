@@ -12,7 +12,8 @@ SPRING_FIELDS); internal variables x begin at s[X].
     evaluate(row, s, eps, x, count, want, out)
         Fill, for `count` points on the present branch, the columns of `out` (columns, count):
         σ in OF_LAW, dσ/dε in SLOPE. With `want` also the derivatives of σ at fixed strain, by the
-        two held numbers in BY_HELD and by parameter c in BY + c. x are internal variables.
+        two held numbers in BY_HELD and by parameter c in BY + c. x are internal variables. An
+        INTERNAL law has results of its own, below.
     switch(row, s, up, out)
         Leave the branch at its upper (up = 1) or lower (0) end, or at a turning point, and enter
         the next. At an end, s.eps and x become those of the end. A BY_STRESS law fills `out`, for
@@ -31,8 +32,10 @@ takes x for the stress and fills ε(x) - ε in MISS. An INTERNAL one has interna
 
     dx/dt = A dε/dt + B,        σ = σ(ε, x) + V(ε, x, dε/dt);
 
-`evaluate` fills V, A and B in the columns from BY + parameters on, and then, with `want`, the
-derivatives of σ, V, A and B by ε, dε/dt, x and the parameters (see `Layout`).
+`evaluate` fills them for one point, from BY on: σ, V, A and B, and their derivatives by ε; with
+`want` = PATHS along A and along B, with `want` > 0 that of V by dε/dt. A point evaluated before is
+not evaluated again. With `want` = DIRECTION it fills `out` with the derivatives of σ, V, A and B at
+the last point, at fixed strain, by dx (`x`) and, unless `count` is negative, by parameter `count`.
 """
 
 from __future__ import annotations
@@ -74,8 +77,16 @@ TINY = 1e-300  # dashpot of a law with V that has none: it counts as damped
 OF_STRESS, OF_HELD, OF_PARAMETER = 0, 1, 3  # columns of the derivatives of `switch`
 EXPLICIT, BY_STRESS, INTERNAL = range(3)
 
-# The layout of the derivatives is in `results_of` and in the solvers.
-OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
+# Of an INTERNAL law: `want`, and what its last point was evaluated with. Its results, see
+# `results_of`: rows of 2 + 2 x numbers; the last point, which has x more numbers; the derivatives
+# of `switch`; and for each direction of the solver its derivatives and dx.
+PATHS, DIRECTION = 2, 3
+BY_STRAIN, ALONG_A, ALONG_B, BY_RATE = range(1, 5)  # rows; the last has one number
+STILL, FADES, FLOWS = range(3)  # internal variables and V: nothing, x decays, or anything else
+WANTED, DERIVED, AT_STRAIN, AT_RATE, ON_BRANCH, POINT = range(6)  # POINT: length without x
+OPTIONS: dict[str, Any] = {
+    "error_model": "numpy", "fastmath": {"contract"}, "no_rewrites": True,
+}  # fmt: skip
 _INSIDE: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 # Without reference counts, which take longer than the loops.
 inner = njit(**_INSIDE, _nrt=False)
@@ -160,15 +171,30 @@ class Compiled(NamedTuple):
     slopes: tuple[int, ...] = ()
     pole: int = -1  #: column of the row with ε_*, if the strain stays below 1 + ε_*
     damps: bool = False  #: whether V depends on the strain rate
+    flows: int = 0  #: how the state changes within a branch: STILL, FADES or FLOWS
 
 
 EVALUATE = 1  #: place among the addresses
 
 
-def results_of(parameters: int, internal: int) -> int:
-    """Return the number of columns of `evaluate`."""
-    values = 2 + 2 * internal
-    return BY + parameters + values + (2 + internal + parameters) * values
+def results_of(parameters: int, internal: int, directions: int = 0) -> int:
+    """Return the number of columns of `evaluate`, and of `switch` after them."""
+    held = parameters + 2 * (OF_PARAMETER + parameters)
+    rows = BY_RATE * (2 + 2 * internal) + 1 + POINT + internal
+    rows += (internal + 1) * (1 + internal + parameters)
+    return BY + max(held, rows + directions * (2 + 3 * internal))
+
+
+@inlined
+def last_point(values, x):  # type: ignore[no-untyped-def]
+    """Return the last point of an INTERNAL law, behind its values."""
+    return past(values, BY_RATE * (2 + 2 * x) + 1)
+
+
+@inlined
+def changes_of(values, x):  # type: ignore[no-untyped-def]
+    """Return the derivatives of `switch` of an INTERNAL law."""
+    return past(last_point(values, x), POINT + x)
 
 
 @intrinsic

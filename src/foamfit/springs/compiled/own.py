@@ -21,21 +21,35 @@ from numba.extending import intrinsic
 
 from foamfit.arrays import Array
 from foamfit.springs.compiled.contract import (
+    ALONG_A,
+    ALONG_B,
+    AT_RATE,
+    AT_STRAIN,
     BY,
     BY_HELD,
+    BY_RATE,
+    DERIVED,
+    DIRECTION,
     EPS,
     EVALUATE,
     EXPLICIT,
+    FADES,
+    FLOWS,
     INTERNAL,
     MISS,
     OF_LAW,
+    ON_BRANCH,
     OPTIONS,
     OWN,
+    PATHS,
+    POINT,
     REAL,
     REALS_AT,
     RESULTS,
     SLOPE,
     SPRING,
+    STILL,
+    WANTED,
     WHOLE,
     Compiled,
     X,
@@ -48,6 +62,7 @@ from foamfit.springs.compiled.contract import (
     evaluating,
     inner,
     inverting,
+    last_point,
     outer,
     past,
     results_of,
@@ -68,7 +83,12 @@ VALUES, ENDS, DOWN, UP = range(4)
 FORMULAS, KIND, COUNT, INSIDE, BOUNDED, DAMPS = range(OWN, OWN + 6)
 _CP = types.CPointer(types.complex128)
 _FORMULAS = WHOLE(_CP, WHOLE, WHOLE, _CP)
-_ALONE: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_ALONE: dict[str, Any] = {
+    **OPTIONS,
+    "no_rewrites": False,
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}
 _WITHIN: dict[str, Any] = {**_ALONE, "_nrt": False}
 FURTHEST, TRIALS = 1e12, 200  # largest strain, and trials, in the search for a strain
 
@@ -102,12 +122,12 @@ def room_of(row, s):  # type: ignore[no-untyped-def]
 
 
 @inner
-def gather(row, s, eps, x, n, j):  # type: ignore[no-untyped-def]
+def gather(row, s, eps, x):  # type: ignore[no-untyped-def]
     """Gather the arguments of the formulas at a point; return them, and room for results."""
     point, inside, count = room_of(row, s), int(s[INSIDE]), int(s[COUNT])
     point[0], point[1] = complex(eps, 0.0), complex(s.rate, 0.0)
     for k in range(inside):
-        point[2 + k] = complex(x[k * n + j], 0.0)
+        point[2 + k] = complex(x[k], 0.0)
     for k in range(count):
         point[2 + inside + k] = complex(row[k], 0.0)
     return point, past(point, 2 + inside + count)
@@ -148,7 +168,7 @@ def bound_stress(row, s, point, found):  # type: ignore[no-untyped-def]
 @inner
 def enter(row, s):  # type: ignore[no-untyped-def]
     """Set the ends of a branch at its beginning."""
-    point, found = gather(row, s, s.eps, past(s, X), 1, 0)
+    point, found = gather(row, s, s.eps, past(s, X))
     bound(row, s, point, found)
     s.sigma_low, s.sigma_high = -math.inf, math.inf
     if s[KIND] == EXPLICIT:
@@ -169,7 +189,7 @@ def _begin(row, s):  # type: ignore[no-untyped-def]
 def evaluate_explicit(row, s, eps, n, want, out):  # type: ignore[no-untyped-def]
     """Fill the results of an EXPLICIT law."""
     where, count, branch = int(s[FORMULAS]), int(s[COUNT]), int(s.branch)
-    point, found = gather(row, s, 0.0, s, 1, 0)
+    point, found = gather(row, s, 0.0, s)
     for j in range(n):
         point[0] = complex(eps[j], STEP)
         call_formulas(where, point, branch, VALUES, found)
@@ -186,36 +206,68 @@ def evaluate_explicit(row, s, eps, n, want, out):  # type: ignore[no-untyped-def
 
 
 @inner
-def evaluate_internal(row, s, eps, x, n, want, out):  # type: ignore[no-untyped-def]
+def is_last(s, eps, x, want, point):  # type: ignore[no-untyped-def]
+    """Whether an INTERNAL law was evaluated here last; else note that it is."""
+    same = want < point[WANTED] and eps == point[AT_STRAIN] and s.branch == point[ON_BRANCH]
+    same = same and (s[DAMPS] == 0.0 or s.rate == point[AT_RATE])
+    for k in range(int(s[INSIDE])):
+        same = same and x[k] == point[POINT + k]
+        point[POINT + k] = x[k]
+    if not same:
+        point[WANTED], point[DERIVED], point[AT_STRAIN] = want + 1.0, 0.0, eps
+        point[AT_RATE], point[ON_BRANCH] = s.rate, s.branch
+    return same
+
+
+@inner
+def derive_along(s, point, found, dx, own, out):  # type: ignore[no-untyped-def]
+    """Fill derivatives of σ, V, A and B by dx and, unless negative, parameter `own`."""
+    inside, total = int(s[INSIDE]), 1.0 if own >= 0 else 0.0
+    for k in range(inside):
+        total += abs(dx[k])
+    if not 0.0 < total < math.inf:
+        for f in range(2 + 2 * inside):
+            out[f] = 0.0 * total
+        return
+    step = STEP / total
+    for k in range(inside):
+        point[2 + k] = complex(point[2 + k].real, step * dx[k])
+    if own >= 0:
+        point[2 + inside + own] = complex(point[2 + inside + own].real, step)
+    call_formulas(int(s[FORMULAS]), point, int(s.branch), VALUES, found)
+    for f in range(2 + 2 * inside):
+        out[f] = found[f].imag / step
+
+
+@inner
+def evaluate_internal(row, s, eps, x, own, want, out):  # type: ignore[no-untyped-def]
     """Fill the results of an INTERNAL law."""
-    where, count, branch = int(s[FORMULAS]), int(s[COUNT]), int(s.branch)
-    inside = int(s[INSIDE])
-    size, at = 2 + 2 * inside, BY + count
-    for j in range(n):
-        point, found = gather(row, s, eps[j], x, n, j)
-        for q in range(2 + inside + count):
-            if q > 0 and (want == 0 or (want == 2 and q >= 2 + inside)):
-                continue
-            if q == 1 and s[DAMPS] == 0.0:
-                for f in range(size):
-                    out[(at + 2 * size + f) * n + j] = 0.0
-                continue
-            kept = point[q]
-            point[q] = complex(kept.real, STEP)
-            call_formulas(where, point, branch, VALUES, found)
-            point[q] = kept
-            if q == 0:
-                for f in range(size):
-                    out[(at + f) * n + j] = found[f].real
-            by = past(out, (at + size + q * size) * n + j)
-            for f in range(size):
-                by[f * n] = found[f].imag / STEP
-        out[OF_LAW * n + j], out[SLOPE * n + j] = out[at * n + j], out[(at + size) * n + j]
-        out[MISS * n + j] = out[BY_HELD * n + j] = out[(BY_HELD + 1) * n + j] = 0.0
-        for c in range(count if want == 1 else 0):
-            out[(BY + c) * n + j] = out[(at + size + (2 + inside + c) * size) * n + j]
-        if s[BOUNDED] > 0.0:  # the ends may depend on the internal variables
-            bound(row, s, point, found)
+    inside, values = int(s[INSIDE]), past(out, BY)
+    size, last = 2 + 2 * inside, last_point(values, inside)
+    if want == DIRECTION:
+        point, found = gather(row, s, s.eps, past(s, X))
+        derive_along(s, point, found, x, own, out)
+        return
+    if is_last(s, eps, x, want, last):
+        return
+    point, found = gather(row, s, eps, x)
+    point[0] = complex(eps, STEP)
+    call_formulas(int(s[FORMULAS]), point, int(s.branch), VALUES, found)
+    for f in range(size):
+        values[f], values[size + f] = found[f].real, found[f].imag / STEP
+    out[OF_LAW], out[SLOPE] = values[0], values[size]
+    point[0] = complex(eps, 0.0)
+    if want and s[DAMPS] > 0.0:
+        point[1] = complex(s.rate, STEP)
+        call_formulas(int(s[FORMULAS]), point, int(s.branch), VALUES, found)
+        values[BY_RATE * size] = found[1].imag / STEP
+        point[1] = complex(s.rate, 0.0)
+    if want == PATHS:
+        derive_along(s, point, found, past(values, 2), -1, past(values, ALONG_A * size))
+        derive_along(s, point, found, past(values, 2 + inside), -1, past(values, ALONG_B * size))
+    if s[BOUNDED] > 0.0:  # the ends may depend on the internal variables
+        point, found = gather(row, s, eps, x)
+        bound(row, s, point, found)
 
 
 @evaluating
@@ -223,7 +275,7 @@ def _evaluate(row, s, eps, x, n, want, out):  # type: ignore[no-untyped-def]
     if s[KIND] == EXPLICIT:
         evaluate_explicit(row, s, eps, n, want, out)
     else:
-        evaluate_internal(row, s, eps, x, n, want, out)
+        evaluate_internal(row, s, eps[0], x, n, want, out)
     return 0.0
 
 
@@ -234,7 +286,7 @@ def derive_switch(row, s, turns, up, out):  # type: ignore[no-untyped-def]
     inside = int(s[INSIDE])
     wide = 1 + inside + count
     for q in range(wide):
-        point, found = gather(row, s, s.eps, past(s, X), 1, 0)
+        point, found = gather(row, s, s.eps, past(s, X))
         at = q if q == 0 else q + 1
         kept = point[at].real
         point[at] = complex(kept, STEP)
@@ -254,7 +306,7 @@ def _switch(row, s, up, out):  # type: ignore[no-untyped-def]
         s.eps = s.high if up else s.low
     if s[KIND] == INTERNAL:
         derive_switch(row, s, turns, up, out)
-    point, found = gather(row, s, s.eps, past(s, X), 1, 0)
+    point, found = gather(row, s, s.eps, past(s, X))
     what = UP if up else DOWN
     s.branch = call_formulas(int(s[FORMULAS]), point, int(s.branch), what, found)
     for k in range(int(s[INSIDE])):
@@ -272,7 +324,7 @@ def _settle(row, s, eps):  # type: ignore[no-untyped-def]
 @inverting
 def _strain(row, s, sigma):  # type: ignore[no-untyped-def]
     """Search by Newton's method inside a bracket."""
-    point, found = gather(row, s, 0.0, past(s, X), 1, 0)
+    point, found = gather(row, s, 0.0, past(s, X))
     if s.sigma_low == s.sigma_high:
         s.soft = math.inf
         return s.low
@@ -312,13 +364,11 @@ def _slope_at_rest(where, row, s):  # type: ignore[no-untyped-def]
     """Return dσ/dε at rest along the path of the internal variables."""
     block, own = as_spring(start(s)), start(row)
     call_begin(where[0], own, block)
-    inside, count, out = int(block[INSIDE]), int(block[COUNT]), past(block, RESULTS)
-    call_evaluate(where[EVALUATE], own, block, past(block, EPS), past(block, X), 1, 2, out)
+    inside, out = int(block[INSIDE]), past(block, RESULTS)
+    call_evaluate(where[EVALUATE], own, block, past(block, EPS), past(block, X), 1, PATHS, out)
     slope = out[SLOPE]
     if block[KIND] == INTERNAL:
-        size, values = 2 + 2 * inside, past(out, BY + count)
-        for k in range(inside):
-            slope += values[size + (2 + k) * size] * values[2 + k]
+        slope += out[BY + ALONG_A * (2 + 2 * inside)]
     return slope
 
 
@@ -418,7 +468,10 @@ def compile_law(law: Law) -> Compiled:
     # parameters, slope at rest, then room for complex numbers
     columns = count + 1 + 2 * (2 + inside + count + max(3, 2 + 2 * inside))
     fill = _fill(given.admissible, count, addresses, RESULTS + results_of(count, inside))
-    return Compiled(fill, kind, columns, count, inside, addresses, (count,), -1, damps > 0.0)
+    flows = FLOWS if given.along or given.viscous else FADES if given.decay else STILL
+    if flows == FADES and (given.ends or given.switch):
+        flows = FLOWS
+    return Compiled(fill, kind, columns, count, inside, addresses, (count,), -1, damps > 0.0, flows)
 
 
 def _fill(

@@ -28,9 +28,11 @@ from foamfit.springs.compiled import compiled
 from foamfit.springs.compiled.contract import (
     BY,
     BY_STRESS,
+    FADES,
     INTERNAL,
     MOST_TERMS,
     RESULTS,
+    Compiled,
     results_of,
 )
 from foamfit.springs.laws.record import OWN_ETA, Law
@@ -132,14 +134,16 @@ def _owned(count: int, directions: list[list[int]]) -> list[int]:
     return [*first, count + 1 + len(listed), *listed]
 
 
-def _functions(shape: Shape, integrated: bool, several: bool, internal: bool) -> tuple[int, ...]:
+def _functions(
+    shape: Shape, integrated: bool, several: bool, internal: bool, fades: bool
+) -> tuple[int, ...]:
     """Return the addresses of the functions that a run needs, 0 for others (see run.ADDRESSES).
 
     A function is compiled when its module is first imported.
     """
     from foamfit.solve.compiled import events, motion
 
-    group = inside = step = drive = write = 0
+    group = inside = step = advance = drive = write = fade = short = 0
     if several:
         from foamfit.solve.compiled import groups
 
@@ -148,10 +152,14 @@ def _functions(shape: Shape, integrated: bool, several: bool, internal: bool) ->
         from foamfit.solve.compiled import internal as inner
 
         inside = inner.INSIDE_AT
-    if integrated:
-        from foamfit.solve.compiled import samples
+    if fades:
+        from foamfit.solve.compiled import decay
 
-        write = samples.WRITE
+        fade = decay.FADE
+    if integrated:
+        from foamfit.solve.compiled import loop, samples
+
+        advance, write = loop.ADVANCE, samples.WRITE
         if shape.degree:
             from foamfit.solve.compiled import implicit
 
@@ -163,8 +171,13 @@ def _functions(shape: Shape, integrated: bool, several: bool, internal: bool) ->
     if integrated and not shape.struck:
         from foamfit.solve.compiled import drive as driven
 
-        drive = driven.DRIVE
-    return motion.RATES, group, inside, events.CHANGE, step, drive, write
+        drive, short = driven.DRIVE, driven.SHORT_STEP
+    return motion.RATES, group, inside, events.CHANGE, step, advance, drive, write, fade, short
+
+
+def _memory_of_decay(one: Compiled, p: int) -> int:
+    """Return the length of the memory of `decay`, 0 if it is not needed."""
+    return one.internal * (11 + 2 * 8 + 4 * p) if one.flows == FADES else 0
 
 
 @lru_cache(maxsize=1024)
@@ -181,13 +194,15 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     kinds, carries = place_state(shape, numbers, nodes)
     base, internals = len(kinds), sum(one.internal for one in made)
     n = base + carries * p
-    wide, results = -4 * (-n // 4), max(results_of(one.derivatives, one.internal) for one in made)
+    results = max(results_of(one.derivatives, one.internal, p) for one in made)
+    wide = -4 * (-n // 4)
     row = RESULTS + results
     width = row + max(one.columns for one in made)
     places, groups_of, reach = order(shape, numbers, nodes) if shape.degree else ([], [], 0)
     size = carries if shape.degree else 0
     parameters = max(one.derivatives for one in made)
     internal = any(one.kind == INTERNAL for one in made)
+    fades = 0 if integrated else _memory_of_decay(made[0], p)
     lengths = {
         "springs": count * width, "per_mass": groups, "drive": len(DRIVE), "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
@@ -195,8 +210,8 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
         "scales": SCALES + count + 2 * nodes + internals,
         "now": len(NOW), "sided": p, "stage": STAGES * wide, "line": LINE * wide, "y": wide,
         "new": wide, "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
-        "batch": BATCH * (6 + BY + parameters) + 3 * p + MOST_TERMS * (9 + p),
-        "aside": count * (1 + shape.terms) + groups + 1 if internal else 0,
+        "batch": BATCH * (6 + BY + parameters) + 2 * p + 8 * MOST_TERMS + 8,
+        "aside": fades or (count * (1 + shape.terms) + groups + 1 if internal else 0),
         "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,
         "largest": p if size else 0, "kept": count * width + groups if size and p else 0,
         "systems": 2 * SYSTEMS * size * (3 * reach + 1),
@@ -212,7 +227,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     several = several or shape.top in (STRESS, VISCOUS)
     words = [
         *at[:-1], *whole[:-1], *([0] * len(GIVEN)),
-        *_functions(shape, integrated, several, internal),
+        *_functions(shape, integrated, several, internal, fades > 0),
         row, width, count, groups, nodes, p, base, carries, shape.terms, shape.top,
         int(shape.solved), wide, shape.degree, reach, 0, 0, 0, 0,
     ]  # fmt: skip

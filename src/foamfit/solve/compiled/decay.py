@@ -1,0 +1,234 @@
+"""Internal variables that decay, of one spring in a known motion: as exact as relaxation terms.
+
+Where dx/dt = L x + N and N depends on the strain alone, x is integrated exactly for the quartic
+through N at both ends and the middle of a step and its slopes at the ends (see `along`), however
+fast it decays. Whether N depends on x is seen when it is computed again.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import cfunc
+
+from foamfit.solve.compiled.along import (
+    FADING,
+    FOLLOWED,
+    OF_STEP,
+    SAME,
+    TABLE,
+    TOO_LONG,
+    UNFIT,
+    derive,
+    tabulate,
+)
+from foamfit.solve.compiled.internal import toward, values_of
+from foamfit.solve.compiled.motion import evaluate
+from foamfit.solve.compiled.run import unpack
+from foamfit.springs.compiled.contract import (
+    ALONG_B,
+    DIRECTION,
+    EPS,
+    OPTIONS,
+    PATHS,
+    X,
+    call_evaluate,
+    inner,
+    past,
+)
+
+DEPENDS = 1e-9  # relative change of N that is not rounding
+# Rows of memory, of one number per internal variable: L; x, N and dN/dr at the start; N and dN/dr
+# at the end; N and x in the middle; x at the end; the largest |x| and |N|. Then the tables of a
+# whole and of half a step, and derivatives: of x and N at the start, of N in the middle and at the
+# end.
+RATE, FIRST_X, FIRST, LOW, LAST, HIGH, MIDDLE, HALF_X, LAST_X, LARGEST, SIZE, TABLES = range(12)
+DERIVATIVES = TABLES + 2 * TABLE
+
+
+@inner
+def _begin(c):  # type: ignore[no-untyped-def]
+    """Fill L, the derivatives of the rates of all internal variables by themselves."""
+    s, n, x, m = c.springs, c.numbers, c.numbers.internals, c.aside
+    unit, out = past(m, x * FIRST_X), past(m, x * TABLES)
+    for k in range(x):
+        unit[k] = 1.0
+        row, at = past(s, c.row), past(s, EPS)
+        call_evaluate(n.evaluate, row, s, at, unit, -1 + c.none, DIRECTION, out)
+        m[x * RATE + k], unit[k] = out[2 + x + k], 0.0
+    for k in range(x):
+        m[x * TABLES + 2 * k * TABLE + OF_STEP] = -1.0
+
+
+@inner
+def _force(c, step, to):  # type: ignore[no-untyped-def]
+    """Fill N and dN/dr at a point."""
+    s, x, m, values = c.springs, c.numbers.internals, c.aside, values_of(c, c.none)
+    for k in range(x):
+        m[x * to + k] = values[2 + x + k] - m[x * RATE + k] * s[X + k]
+        m[x * (to + 1) + k] = values[4 + 3 * x + k] * step
+        m[x * SIZE + k] = max(m[x * SIZE + k], abs(m[x * to + k]))
+
+
+@inner
+def _is_other(c, to):  # type: ignore[no-untyped-def]
+    """Whether N is not what it was with other internal variables."""
+    s, x, m, values = c.springs, c.numbers.internals, c.aside, values_of(c, c.none)
+    for k in range(x):
+        part = m[x * RATE + k] * s[X + k]
+        miss = abs(values[2 + x + k] - part - m[x * to + k])
+        if not miss <= DEPENDS * (m[x * SIZE + k] + abs(part)):
+            return True
+    return False
+
+
+@inner
+def _put(c, eps, at, want):  # type: ignore[no-untyped-def]
+    """Bring the spring to a strain and internal variables."""
+    s, n, x = c.springs, c.numbers, c.numbers.internals
+    s.eps = eps
+    for k in range(x):
+        s[X + k] = c.y[n.x_at + k] = c.aside[x * at + k]
+    evaluate(c, c.none, want)
+
+
+@inner
+def _slope(c, step, h):  # type: ignore[no-untyped-def]
+    """Return dσ/dr at a point evaluated with `want` = PATHS."""
+    size = 2 + 2 * c.numbers.internals
+    return c.springs.slope * step + values_of(c, c.none)[ALONG_B * size] * h
+
+
+@inner
+def _respond(c, h, tol):  # type: ignore[no-untyped-def]
+    """Fill the internal variables in the middle and at the end; false if a step is too long."""
+    x, m, fine = c.numbers.internals, c.aside, True
+    for k in range(x):
+        if not m[x * RATE + k] <= 0.0:
+            return False
+        table, half = past(m, x * TABLES + 2 * k * TABLE), past(m, x * TABLES + (2 * k + 1) * TABLE)
+        fade = -m[x * RATE + k] * h
+        if abs(h - table[OF_STEP]) > 1e-13 * h:
+            tabulate(fade, h, table)
+            tabulate(0.5 * fade, 0.5 * h, half)
+        first, last, low, high = (
+            m[x * FIRST + k], m[x * LAST + k], m[x * LOW + k], m[x * HIGH + k],
+        )  # fmt: skip
+        rise = last - first
+        bump = m[x * MIDDLE + k] - (0.5 * (first + last) + 0.125 * (low - high))
+        square = 3.0 * rise - 2.0 * low - high + 16.0 * bump
+        cube, fourth = low + high - 2.0 * rise - 32.0 * bump, 16.0 * bump
+        whole = first * table[0] + low * table[1] + square * table[2]
+        whole += cube * table[3] + fourth * table[4]
+        part = first * half[0] + 0.5 * low * half[1] + 0.25 * square * half[2]
+        part += 0.125 * cube * half[3] + 0.0625 * fourth * half[4]
+        before = m[x * FIRST_X + k]
+        m[x * HALF_X + k] = math.exp(-0.5 * fade) * before + 0.5 * h * part
+        m[x * LAST_X + k] = math.exp(-fade) * before + h * whole
+        size = max(m[x * LARGEST + k], abs(m[x * LAST_X + k]))
+        fine = fine and not FOLLOWED * h * table[0] * abs(bump) > tol * size
+        if fine:
+            m[x * LARGEST + k] = size
+    return fine
+
+
+# ---------------------------------------------------------------- derivatives
+
+
+@inner
+def _change(c, seed, to):  # type: ignore[no-untyped-def]
+    """Fill the derivatives of N at a point, `to` 1 (start), 2 (middle) or 3 (end)."""
+    x, m, p, values = c.numbers.internals, c.aside, c.p, values_of(c, c.none)
+    derive(c, seed)
+    rows = past(m, x * DERIVATIVES)
+    for j in range(p):
+        out, strain = toward(c, c.none, j), c.strain[j]
+        for k in range(x):
+            own = out[2 + x + k] - m[x * RATE + k] * out[2 + 2 * x + k]
+            rows[(to * x + k) * p + j] = own + values[4 + 3 * x + k] * strain
+
+
+@inner
+def _move(c, h, whole):  # type: ignore[no-untyped-def]
+    """Fill the derivatives of the internal variables at the end of a step, or in its middle."""
+    x, m, p, n = c.numbers.internals, c.aside, c.p, c.numbers
+    rows, long = past(m, x * DERIVATIVES), 1.0 if whole else 0.5
+    for k in range(x):
+        a = past(m, x * TABLES + (2 * k + 1 - whole) * TABLE)
+        decay, dx = math.exp(m[x * RATE + k] * h * long), past(c.y, c.base + (n.x_at + k) * p)
+        for j in range(p):
+            first, middle, last = (
+                rows[(x + k) * p + j], rows[(2 * x + k) * p + j], rows[(3 * x + k) * p + j],
+            )  # fmt: skip
+            low, square = 4.0 * middle - 3.0 * first - last, 2.0 * (first + last) - 4.0 * middle
+            step = first * a[0] + long * (low * a[1] + long * square * a[2])
+            dx[j] = decay * rows[k * p + j] + h * long * step
+
+
+@inner
+def _keep(c, seed, h):  # type: ignore[no-untyped-def]
+    """Keep the start of a step, or return to it if h is negative."""
+    x, m, p, y, n = c.numbers.internals, c.aside, c.p, c.y, c.numbers
+    rows, mine = past(m, x * DERIVATIVES), c.base + n.x_at * p
+    for k in range(x * p):
+        if h < 0.0:
+            y[mine + k] = rows[k]
+        else:
+            rows[k] = y[mine + k]
+    for k in range(x if h >= 0.0 else c.none):
+        m[x * FIRST_X + k] = c.springs[X + k]
+    if h >= 0.0 and p > 0:
+        _change(c, seed, 1)
+
+
+@cfunc(FADING, **OPTIONS, cache=True)
+def _fade(words, part, h, tol, seed, room):  # type: ignore[no-untyped-def]
+    """Step to a strain within h; begin a run if h is zero, go back a step if it is negative.
+
+    `room` becomes the stress in the middle of the step, its slopes at both ends, and its
+    derivatives in the middle.
+    """
+    c = unpack(words)
+    s, want = c.springs, PATHS if c.terms > 0 else c.none
+    if h == 0.0:
+        _begin(c)
+        return SAME + c.none
+    if h < 0.0:
+        _keep(c, seed, h)
+        _put(c, part, FIRST_X, want)
+        derive(c, seed)
+        return SAME + c.none
+    origin, step = s.eps, part - s.eps
+    evaluate(c, c.none, want)
+    room[1] = _slope(c, step, h)
+    _keep(c, seed, h)
+    _force(c, step, FIRST)
+    _put(c, origin + 0.5 * step, FIRST_X, c.none)
+    _force(c, step, MIDDLE)
+    _put(c, part, FIRST_X, c.none)
+    _force(c, step, LAST)
+    if not _respond(c, h, tol):
+        _put(c, origin, FIRST_X, want)
+        derive(c, seed)
+        return TOO_LONG + c.none
+    if c.p > 0:
+        _put(c, part, LAST_X, c.none)
+        _change(c, seed, 3)
+    _put(c, origin + 0.5 * step, HALF_X, c.none)
+    room[0], other = s.sigma, _is_other(c, MIDDLE)
+    if c.p > 0:
+        _change(c, seed, 2)
+        _move(c, h, c.none)
+        derive(c, seed)
+        for j in range(c.p):
+            room[3 + j] = c.common[j]
+    _put(c, part, LAST_X, want)
+    if other or _is_other(c, LAST):
+        return UNFIT + c.none
+    _move(c, h, 1 + c.none)
+    derive(c, seed)
+    room[2] = _slope(c, step, h)
+    return SAME + c.none
+
+
+FADE = _fade.address
