@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import lmfit
@@ -264,7 +265,7 @@ class _Comparison:
             self.progress(done, f"model {self.number} of {self.of}: {named}: {what}")
 
         options = replace(self.options, max_time=left, relaxation=model.relaxation)
-        look = self._look if len(model.kinds) > 1 else None
+        look = partial(self._look, damping) if len(model.kinds) > 1 else None
         found = one_model.identify(self.measurement, model.name, params, options, tell, look, below)
         (result, best), predicted = one_model.judge(found, COMPARED, lambda _: None), None
         if not result.stopped:
@@ -273,9 +274,13 @@ class _Comparison:
         self.fits.append(found)
         return Tried(result, damping, best, time.perf_counter() - began, predicted)
 
-    def _look(self, problem: Problem, values: Array) -> None:
-        """Stop the fit of a chain if its first descents are far worse than one spring."""
-        alone = [one for one in self.tried if len(Model.parse(one.result.model).kinds) == 1]
+    def _look(self, damping: str, problem: Problem, values: Array) -> None:
+        """Stop the fit of a chain if its first descents are far worse than one spring.
+
+        Springs are compared with and without `damping` alike.
+        """
+        like = [one for one in self.tried if damping in (one.damping, "none")]
+        alone = [one for one in like if len(Model.parse(one.result.model).kinds) == 1]
         objective = problem.objective
         found = misfit_of(objective, objective.residual(values))
         best = min(alone, key=lambda one: one.misfit, default=None)

@@ -19,7 +19,7 @@ from conftest import EXPERIMENTS, run, without_pictures
 from foamfit import api
 from foamfit.solve import cache, precompile
 from foamfit.solve.compiled import loop
-from foamfit.springs.compiled import bistable
+from foamfit.springs.compiled import bistable, stale
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 # Reads a test, compiles for a model, fits, and prints what the fit compiled
@@ -123,6 +123,22 @@ def test_what_was_compiled_of_another_source_is_no_use(
     assert [path.exists() for path in made] == [True, False]
 
 
+def test_a_spring_does_not_load_what_was_compiled_of_another_source(tmp_path: Path) -> None:
+    """Once, the strain of a spring ran code of an older layout before any check."""
+    code = "import foamfit as ff; s = ff.LinearSpring(1e6); print(float(s.strain([0, 1e5])[1]))"
+    given = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", code]
+    told = subprocess.run(command, env=given, capture_output=True, text=True, check=True)
+    files = sorted(tmp_path.rglob("*.nb[ci]"))
+    assert len({path.parent for path in files}) == 2
+    for path in files:
+        path.write_bytes(b"of another source")
+        os.utime(path, (0.0, 0.0))
+    again = subprocess.run(command, env=given, capture_output=True, text=True, check=True)
+    assert again.stdout == told.stdout
+    assert all(path.stat().st_mtime > 0.0 for path in tmp_path.rglob("*.nb[ci]"))
+
+
 def test_what_is_compiled_where_it_is_needed_is_announced_once(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -148,11 +164,11 @@ def test_what_is_compiled_where_it_is_needed_is_announced_once(
 def test_every_module_with_compiled_loops_is_known() -> None:
     """Modules outside `FOLDERS` do not compile; the folders of all caches are watched."""
     written = {
-        path.relative_to(cache.PACKAGE)
-        for path in cache.PACKAGE.rglob("*.py")
+        path.relative_to(stale.PACKAGE)
+        for path in stale.PACKAGE.rglob("*.py")
         if re.search(r"\b(njit|cfunc)\b|^@(inner|inlined|outer)$", path.read_text(), re.M)
     }
-    assert set(cache.FOLDERS) == {path.parts[0] for path in written}
-    stored = {cache.PACKAGE / path.parent / "__pycache__" for path in written}
+    assert set(stale.FOLDERS) == {path.parts[0] for path in written}
+    stored = {stale.PACKAGE / path.parent / "__pycache__" for path in written}
     if not os.environ.get("NUMBA_CACHE_DIR"):
         assert cache._caches() == stored

@@ -7,13 +7,12 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from foamfit.springs.compiled.stale import drop_stale
+
 LOG = logging.getLogger(__name__)
-PACKAGE = Path(__file__).parents[1]
-FOLDERS = ("springs", "solve")  # subfolders with compiled loops
 
 
 def _caches() -> set[Path]:
@@ -52,19 +51,11 @@ def compiling(what: str) -> str:
 def compiled(name: str = "integrate") -> bool:
     """Whether the cache contains a loop compiled from the current source.
 
-    Files older than any module in `FOLDERS` are removed, because numba itself checks only the
-    module of the outermost loop.
+    Files of another source are removed before; see `springs.compiled.stale`.
     """
-    times = [path.stat().st_mtime for name in FOLDERS for path in (PACKAGE / name).rglob("*.py")]
-    written = max((at for at in times if at <= time.time()), default=0.0)  # a clock may be wrong
-    fresh = False
-    for file in (path for cache in _caches() for path in cache.glob("*.nb[ci]")):
-        if file.stat().st_mtime < written:
-            with suppress(OSError):  # no permission
-                file.unlink(missing_ok=True)
-        elif f".{name}-" in file.name:
-            fresh = fresh or file.suffix == ".nbc"
-    return fresh
+    for folder in (caches := _caches()):
+        drop_stale(folder)
+    return any(True for folder in caches for _ in folder.glob(f"*.{name}-*.nbc"))
 
 
 class Spent(threading.local):

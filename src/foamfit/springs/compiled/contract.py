@@ -42,6 +42,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from inspect import Parameter, Signature
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from llvmlite import ir
@@ -49,6 +50,8 @@ from numba import cfunc, njit, types
 from numba.core.imputils import lower_setattr_generic
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import infer_getattr, intrinsic, lower_getattr_generic, models, register_model
+
+from foamfit.springs.compiled.stale import drop_stale
 
 HELD, OWN, MEMORY = 6, 8, 48  # memory: on two held numbers, then what the law keeps
 X, MOST_INTERNAL = 64, 32  # internal variables
@@ -93,6 +96,14 @@ inner = njit(**_INSIDE, _nrt=False)
 inlined = njit(**_INSIDE, _nrt=False, forceinline=True)
 # Called from Python.
 outer = njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
+
+
+def _nothing() -> None:
+    """Tell, compiled by numba, where its cache is."""
+
+
+if (_stats := getattr(outer(_nothing), "stats", None)) is not None:  # None: numba is disabled
+    drop_stale(Path(_stats.cache_path or "."))
 
 REAL, WHOLE = types.float64, types.int64
 REALS_AT, WHOLES_AT = types.CPointer(REAL), types.CPointer(WHOLE)
