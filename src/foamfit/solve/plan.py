@@ -195,7 +195,7 @@ class Plan(NamedTuple):
         if outcome == scenes.STEP_UNDERFLOW:
             fastest = max(self.fastest_rates(rows, heights, drag))
             endings[loop.OUTCOME] = scenes.TOO_FAST if fastest > FASTEST else scenes.STEP_UNDERFLOW
-        lost = _lost(endings) if degree else 0.0
+        lost = loop.lost(endings) if degree else 0.0
         method, strongest = RADAU if degree else EXPLICIT_STEPS, endings.item(loop.STRONGEST)
         return self._motion(out, method, endings, log, rows, lost, strongest)
 
@@ -364,16 +364,6 @@ class Plan(NamedTuple):
 def _memory(layout: Layout) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Return the words of a run, and memory for its integers and floats."""
     return layout.words, np.empty_like(layout.words), np.zeros(layout.floats)
-
-
-def _lost(endings: Array) -> float:
-    """Return the size of the vibrations that implicit steps damped out, relative to the ranges."""
-    lost, moved = float(endings[loop.DAMPED_OUT]), float(endings[loop.FARTHEST])
-    motion, stress = endings[loop.MOTION_LOST : loop.STRESS_LOST + 1].tolist()
-    if motion > 0.0:
-        share = motion / moved if moved > 0.0 else 0.0
-        lost += max(share, stress / float(endings[loop.STRONGEST]))
-    return lost
 
 
 def _time(t: ArrayLike) -> Array:

@@ -6,6 +6,7 @@ import math
 
 from numba import cfunc, njit
 
+from foamfit.arrays import Array
 from foamfit.solve.compiled.events import (
     DOUBTFUL,
     FAILED,
@@ -363,3 +364,13 @@ def integrate(  # type: ignore[no-untyped-def]
     endings[MOTION_LOST], endings[STRESS_LOST] = c.worst[0], c.worst[1]
     for j in range(c.p):
         endings[ENDINGS + j] = c.sided[j]
+
+
+def lost(endings: Array) -> float:
+    """Return the size of the vibrations that implicit steps damped out, relative to the ranges."""
+    damped, moved = float(endings[DAMPED_OUT]), float(endings[FARTHEST])
+    motion, stress = endings[MOTION_LOST : STRESS_LOST + 1].tolist()
+    if motion > 0.0:
+        share = motion / moved if moved > 0.0 else 0.0
+        damped += max(share, stress / float(endings[STRONGEST]))
+    return damped

@@ -39,7 +39,7 @@ def compiled(law: Law) -> Compiled:
 
     if not isinstance(given, Functions):
         return given  # of a law that the solver has made
-    from foamfit.springs.compiled.own import compile_law
+    from foamfit.springs.compiled.registered import compile_law
 
     return compile_law(law)
 
