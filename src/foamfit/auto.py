@@ -231,7 +231,9 @@ class _Comparison:
                 return
             try:
                 one = self._fit(model, damping, left, i / len(dampings), 1.0 / len(dampings))
-            except (_UnpromisingError, SimulationError) as error:  # damping would not help
+            except (_UnpromisingError, SimulationError) as error:
+                if damping == "without" and _is_damped(self.tried):
+                    continue
                 self.unpromising += [model] if isinstance(error, _UnpromisingError) else []
                 self._skip(model, str(error).removeprefix(f"{self.measurement.name}: "))
                 return
@@ -289,6 +291,15 @@ class _Comparison:
                 f"its first descents miss the curves by {percent(found)} of the range, "
                 f"{best.name} by {percent(best.misfit)}"
             )
+
+
+def _is_damped(tried: Sequence[Tried]) -> bool:
+    """Return whether a model with damping misses far less than every model without."""
+    least = {
+        damping: min((one.misfit for one in tried if one.damping == damping), default=math.nan)
+        for damping in ("without", "with")
+    }
+    return UNPROMISING * least["with"] < least["without"]
 
 
 def _hopeless(model: Model, tried: Sequence[Tried], unpromising: Sequence[Model] = ()) -> str:

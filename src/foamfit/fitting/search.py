@@ -252,9 +252,9 @@ def search(
     """
     progress(0.0, "start values")
     points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
+    given = [space.encode(values) for values in known]
     if known:
-        points += [space.encode(values) for values in known]
-        starts = max(starts // FEWER, LEAST)
+        points, starts = points + given, max(starts // FEWER, LEAST)
     out: list[tuple[float, int]] = []
     several = has_several(space.model)
     attempts, edges, left = 1 if known else ATTEMPTS + several, list[float](), np.inf
@@ -269,6 +269,7 @@ def search(
             tracker.look()
         promising = [item for item in ranked if item[0] <= PROMISING * ranked[0][0]]
         points = [point for _, point in distinct(promising)][: max(3, starts // 4)]
+        points += [point for _, point in distinct(rank(tracker, space, given))[:LEAST]]
         for i, point in enumerate(points):
             progress(ON_CURVES + (REFINED - ON_CURVES) * i / len(points), "curves")
             cost, end = descend(tracker, space, point, 60)

@@ -5,7 +5,7 @@ Other points lie beside the best one found: the search may have ended in a wrong
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import product
 
@@ -158,33 +158,56 @@ def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array
 def carried(space: Space, below: Space, minima: Iterable[Array]) -> list[Array]:
     """Return start points from the minima of a model that this one contains.
 
-    Springs are matched from the top. A new linear spring starts short and stiff, and new relaxation
-    terms are weak, of several times, so that the curves start nearly as those of that fit.
+    Springs are matched from the top. A new linear spring starts short and stiff, new relaxation
+    terms are weak, of several times, and other new parameters without effect, so that the curves
+    start nearly as those of that fit.
     """
     kinds, was = ([law.word or law.kind for law in one.model.laws] for one in (space, below))
-    sources = {}
+    sources = dict[int, int]()
     for spring in reversed(range(len(kinds))):
         if was and kinds[spring] == was[-1]:
             was.pop()
             sources[spring] = len(was)
-    out, index = list[Array](), {name: i for i, name in enumerate(below.names)}
-    for values, share in product(minima, CARRIED_TIMES if space.model.relaxation else (1.0,)):
-        start = space.values.copy()
-        for at, name in enumerate(space.names):
-            spring, short = split_name(name)
-            source = name if spring < 0 else f"s{sources.get(spring, -1) + 1}_{short}"
-            if name not in space.free:
-                continue
-            if source in index:
-                start[at] = values[index[source]]
-            elif spring in sources and family(short) in ("g", "tau"):
-                start[at] = WEAK if family(short) == "g" else share * space.scales.duration
-            elif spring >= 0 and spring not in sources and kinds[spring] == "linear":
-                start[at] = space.low[at] if short == "height" else 0.1 * space.high[at]
-        start = space.complete(start)
-        if not any(np.array_equal(start, other) for other in out):
-            out.append(start)
-    return out
+    times = CARRIED_TIMES if space.model.relaxation > below.model.relaxation else (1.0,)
+    return [
+        _carried_one(space, below, values, sources, share)
+        for values, share in product(minima, times)
+    ]
+
+
+def _carried_one(
+    space: Space, below: Space, values: Array, sources: Mapping[int, int], share: float
+) -> Array:
+    """Return one of the points of `carried`; `share` is that of the relaxation time."""
+    start, index = space.values.copy(), {name: i for i, name in enumerate(below.names)}
+    for at, name in enumerate(space.names):
+        spring, short = split_name(name)
+        source = name if spring < 0 else f"s{sources.get(spring, -1) + 1}_{short}"
+        if name not in space.free:
+            continue
+        if source in index:
+            start[at] = values[index[source]]
+        elif spring in sources and family(short) in ("g", "tau"):
+            start[at] = WEAK if family(short) == "g" else share * space.scales.duration
+        elif spring in sources and (neutral := space.model.param(name).neutral) is not None:
+            start[at] = neutral
+        elif spring >= 0 and spring not in sources:
+            start[at] = space.low[at] if short == "height" else 0.1 * space.high[at]
+    start = space.complete(start)
+    before, now = _heights(below, values), _heights(space, start)
+    for spring, source in sources.items():  # the same stresses and elongations
+        law = space.model.laws[spring]
+        if law.exchanged is not None and now[spring] != before[source]:
+            own = space.model.own(spring, start)[:-1]
+            own[:] = law.exchanged[1](law.exchanged[0](own, before[source]), now[spring])
+    return start
+
+
+def _heights(space: Space, values: Array) -> list[float]:
+    """Return the heights of the springs, m."""
+    given = dict(zip(space.names, values.tolist(), strict=True))
+    names = [f"s{i}_height" for i in range(1, len(space.model.kinds) + 1)]
+    return [given.get(name, space.scales.height) for name in names]
 
 
 # ---------------------------------------------------------------- beside the best point
