@@ -195,11 +195,11 @@ def _carried_one(
             start[at] = space.low[at] if short == "height" else 0.1 * space.high[at]
     start = space.complete(start)
     before, now = _heights(below, values), _heights(space, start)
-    for spring, source in sources.items():  # the same stresses and elongations
+    for spring, place in sources.items():  # the same stresses and elongations
         law = space.model.laws[spring]
-        if law.exchanged is not None and now[spring] != before[source]:
+        if law.exchanged is not None and now[spring] != before[place]:
             own = space.model.own(spring, start)[:-1]
-            own[:] = law.exchanged[1](law.exchanged[0](own, before[source]), now[spring])
+            own[:] = law.exchanged[1](law.exchanged[0](own, before[place]), now[spring])
     return start
 
 
