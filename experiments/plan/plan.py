@@ -227,7 +227,7 @@ def draw_figure(rows: pd.DataFrame, found: pd.DataFrame, path: Path) -> None:
         left.axhline(90.0, color="black", linewidth=0.6, linestyle=":")
         left.set_xticks(range(5), ["first test\nalone", *SECOND], fontsize=6.5)
         left.set_ylabel("parameters determined (%)")
-        left.legend(loc="lower right", fontsize=6.5, frameon=True)
+        left.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=6.5)
         ends = np.array([1e-3, 3.0])
         for factor, dashes in ((1.0, "-"), (1.5, ":"), (1 / 1.5, ":")):
             right.plot(ends, factor * ends, color="black", linewidth=0.5, linestyle=dashes)
