@@ -109,20 +109,6 @@ def test_the_first_use_says_that_it_compiles(
     assert asked == [("integrate", "bistable"), ("follow", "bistable")]
 
 
-def test_what_was_compiled_of_another_source_is_no_use(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    keep_in(tmp_path, monkeypatch)
-    assert not cache.compiled()
-    made = [tmp_path / f"loop.integrate-30.py311.{end}" for end in ("nbi", "1.nbc")]
-    for path in made:
-        path.touch()
-    assert cache.compiled()
-    os.utime(made[1], (0.0, 0.0))
-    assert not cache.compiled()
-    assert [path.exists() for path in made] == [True, False]
-
-
 def test_a_spring_does_not_load_what_was_compiled_of_another_source(tmp_path: Path) -> None:
     """Once, the strain of a spring ran code of an older layout before any check."""
     code = "import foamfit as ff; s = ff.LinearSpring(1e6); print(float(s.strain([0, 1e5])[1]))"

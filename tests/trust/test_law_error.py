@@ -270,10 +270,7 @@ def test_twins_get_the_same_states(thin_foams, tmp_path):
 
 @needs_data
 def test_an_uncertain_motion_is_no_excuse_for_an_error_of_the_law(tmp_path):
-    """Weighed by the noise of the motion, this fit once missed the stress by 1.3 % of the range.
-
-    Measured by others: see the study of damage.
-    """
+    """Weighed by the motion's noise, this fit once missed by 1.3 % (record: study of damage)."""
     toml = tmp_path / "lattice.toml"
     studies.write_specimen(toml, "12 mm", "20 mm", studies.LATTICE)
     test = ff.read_test(DATA / "lattice-cycles" / "tpu87-35_raw.csv", toml, cycle=10)
