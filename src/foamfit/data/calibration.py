@@ -168,7 +168,8 @@ def balance(test: Measurement) -> Balance:
     if not (striker.mass and striker.velocity) or test.motion == INTEGRATED:
         return Balance()
     integrated = "displacement" in test.derived  # from the acceleration, with the stated velocity
-    if is_clipped(test) or (test.braked and integrated) or float(stress.max()) <= 0.0:
+    still = float(stress.max()) <= 0.0 or float(np.ptp(w)) <= 0.0
+    if is_clipped(test) or (test.braked and integrated) or still:
         return Balance(test.flight)
     given = with_noise(test), striker.mass, w, stress, time
     fitted = _fitted(*given)
@@ -212,17 +213,19 @@ def _fitted(
     scatter, steps = max(noise.sigma, 1e-9 * float(np.ptp(w))), noise.time
     for _ in range(_ROUNDS):
         rows = kept & (time - late <= time[-1])  # the force there is in the record
+        if np.count_nonzero(rows) < _FEWEST:
+            return None
         t = time[rows]
         slowed, braked = (np.interp(t - late, time, part) for part in integrals)
         columns = np.column_stack([np.ones(t.size), t, -braked, 0.5 * t**2, slowed, damper[rows]])
         columns = columns if damped else columns[:, :-1]
         y, priors = w[rows] - 0.5 * (gravity or 0.0) * t**2, [*known, (4, -late, most)]
         found, errors = _solved(columns, y, scatter * math.sqrt(steps), priors)
+        if found[2] <= 0.0:
+            return None
         left, late = y - columns @ found, late + float(found[4] / found[2])
         rms = math.sqrt(left @ left / max(left.size - found.size, 1))
         scatter, steps = max(scatter, rms), max(steps, residual_time(left))
-    if found[2] <= 0.0:
-        return None
     # The inertia of the specimen, and the noise of the force, which the integral sums up.
     inertia = 0.5 * (test.specimen.mass or 0.0) / mass
     summed = of_force.sigma * math.sqrt(of_force.time / time.size) / float(stress.mean())
@@ -247,5 +250,6 @@ def _solved(
     matrix = np.concatenate([columns / scatter, rows])
     right = np.append(y / scatter, [mean / sigma for _, mean, sigma in known])
     sizes = np.linalg.norm(matrix, axis=0)
+    sizes[sizes == 0.0] = 1.0
     inverse = np.linalg.pinv(matrix / sizes)
     return inverse @ right / sizes, np.linalg.norm(inverse, axis=1) / sizes
