@@ -22,7 +22,7 @@ from foamfit.results import Intervals, Profile
 from foamfit.springs.parameters import NUISANCE
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import WEAK
+from foamfit.trust.covariance import NOTHING, WEAK
 from foamfit.trust.markov_chain import mcmc, walkers
 from foamfit.trust.profile import BETTER, PLACED, STEPS, Refit, departures, trace
 
@@ -41,7 +41,8 @@ FAR = 1.0 - 1e-9
 # Iterations of a refit at a value one width outside an interval.
 ITERATIONS = 10
 Announce = Callable[[str], None]
-Minima = Sequence[tuple[Array, Array]]  # points at which descents ended, and their residuals
+# Points at which descents ended, their residuals and `_halves`.
+Minima = Sequence[tuple[Array, Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -90,18 +91,21 @@ def assess(
         announce(say("interval", "cost", by=method, count=count, seconds=_seconds(best, count)))
     if method == "mcmc":
         return _by_mcmc(best, choice, tracker)
-    others = [(point, tracker.consider(point)) for point in minima]
+    others = [(x, residual := tracker.consider(x), _halves(best, x, residual)) for x in minima]
     if method == "profile":
         return _with_minima(best, _by_profiles(best, known, tracker), others)
     far = np.abs(departures(best)).max(axis=1, initial=0.0)
-    for point, residual in others:  # a minimum within the cut but outside the local interval
+    for point, residual, _ in others:  # a minimum within the cut but outside the local interval
         apart = np.abs(point - best.values)[best.places] / best.spread.stderr
         far[(best.rises(residual) < best.quantiles**2) & (apart > best.quantiles)] = np.inf
     order = sorted(known, key=lambda name: -far[best.names.index(name)])
     bent = [name for name in order if far[best.names.index(name)] > BENT]
-    # Where the range is wider, model error outweighs noise, and a local interval is enough.
+    # Where the range is wider, model error outweighs noise, and a local interval is enough. Where
+    # other minima leave the parameter undetermined, a profile would not change that.
     local = [n for n in bent if n in ranges and np.ptp(ranges[n]) > np.ptp(best.local(n))]
-    made = _by_profiles(best, [n for n in bent if n not in local], tracker, budget)
+    wide = _with_minima(best, Intervals(), others).ends
+    lost = [n for n in bent if n in wide and np.ptp(wide[n]) > 2.0 * NOTHING * best.size(n)]
+    made = _by_profiles(best, [n for n in bent if n not in (*local, *lost)], tracker, budget)
     made = _with_minima(best, replace(made, doubtful=(*made.doubtful, *local)), others)
     return made if best.misfits or made.better is not None else _with_far(best, made, tracker)
 
@@ -120,8 +124,7 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
     """
     ends, methods = dict(made.ends), dict(made.methods)
     intervals = {name: made.ends.get(name, best.local(name)) for name in best.known}
-    for point, residual in minima:
-        halves = _halves(best, point, residual)
+    for point, _, halves in minima:
         for name, (low, high) in intervals.items():
             if math.isfinite(half := float(halves[best.names.index(name)])):
                 value = float(point[best.index[name]])
@@ -130,7 +133,7 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
                     intervals[name] = ends[name] = wider
                     methods[name] = "other minima"
     made, elsewhere = replace(made, ends=ends, methods=methods), dict[str, float]()
-    for point, residual in () if best.misfits else minima:
+    for point, residual, _ in () if best.misfits else minima:
         elsewhere = _far_values(best, made, point, residual) | elsewhere
     return replace(made, elsewhere=elsewhere)
 
