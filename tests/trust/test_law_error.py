@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -68,6 +69,17 @@ def test_the_noise_beside_an_error_of_the_law_is_that_of_the_high_frequencies(si
     power = [one.noise.variance * one.noise.tau for one in found]
     assert np.mean(power) == pytest.approx(1.0, rel=0.1)
     assert np.mean([one.law for one in found]) == pytest.approx(size, rel=0.15)
+
+
+@pytest.mark.parametrize(("n", "size"), [(60, 10.0), (60, 100.0), (100, 30.0), (300, 100.0)])
+def test_a_short_record_does_not_leave_the_noise_too_small(n, size):
+    """The spectrum alone left a hundredth of it beside a large error of the law."""
+    rng = np.random.default_rng(5)
+    found = [of(size * wave(n) + correlated(rng, n, 0.0)) for _ in range(20)]
+    assert all(one.found for one in found)
+    sigma = [math.sqrt(one.noise.variance) for one in found]
+    assert min(sigma) > 0.4
+    assert 0.75 < np.median(sigma) < 1.25
 
 
 def test_an_error_below_that_of_the_simulation_is_none():
@@ -268,11 +280,28 @@ def test_twins_get_the_same_states(thin_foams, tmp_path):
     assert not any("determined" in own for key, own in states.items() if scatter[key] > 0.5)
 
 
+def lattice(folder, name, cycle):
+    toml = folder / "lattice.toml"
+    studies.write_specimen(toml, "12 mm", "20 mm", studies.LATTICE)
+    return ff.read_test(DATA / "lattice-cycles" / f"{name}_raw.csv", toml, cycle=cycle)
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("name", "model", "terms"), [("tpu87-20", "bistable", 0), ("tpu87-50", "microscale", 1)]
+)
+def test_a_slow_error_of_the_law_in_a_short_record_is_no_noise(name, model, terms, tmp_path):
+    """The spectrum of 100 samples alone took residuals of 41 and 9 times the noise for noise."""
+    test = lattice(tmp_path, name, 1)
+    found = ff.fit(test, model=model, relaxation=terms, starts=4, intervals="local")
+    told = found.noise["stress_strain"]
+    assert told["law_error"] > 0.8 * found.misfit["stress_strain"] * told["range"]
+    assert told["law_error"] > 5.0 * told["sigma"]
+
+
 @needs_data
 def test_an_uncertain_motion_is_no_excuse_for_an_error_of_the_law(tmp_path):
     """Weighed by the motion's noise, this fit once missed by 1.3 % (record: study of damage)."""
-    toml = tmp_path / "lattice.toml"
-    studies.write_specimen(toml, "12 mm", "20 mm", studies.LATTICE)
-    test = ff.read_test(DATA / "lattice-cycles" / "tpu87-35_raw.csv", toml, cycle=10)
+    test = lattice(tmp_path, "tpu87-35", 10)
     found = ff.fit(test, model="microscale", relaxation=1, starts=4, intervals="local")
     assert found.misfit["stress_strain"] < 0.0035

@@ -25,7 +25,7 @@ _CUT_SHARE = 0.9733369246625415  # variance of a standard normal variable trunca
 
 
 @cache
-def _residual_filter(width: int) -> tuple[Array, Array]:
+def residual_filter(width: int) -> tuple[Array, Array]:
     """Return the weights of "sample minus local cubic", and their autocorrelation."""
     cubic = np.vander(np.linspace(-1.0, 1.0, width), 4)
     weights = -(cubic @ np.linalg.pinv(cubic))[width // 2]
@@ -70,7 +70,7 @@ def residual_noise(values: Array) -> tuple[float, float]:
     if n < 12:
         return digital, 0.0
     widths = [w for w in _WIDTHS if w <= max(11, n // _SHARE)]
-    filters = [_residual_filter(w) for w in widths]
+    filters = [residual_filter(w) for w in widths]
     variance = np.array([robust_variance(np.convolve(values, w, "valid")) for w, _ in filters])
     if variance.min() <= 0.0:
         return digital, 0.0

@@ -55,6 +55,11 @@ class NoiseProcess:
             return 1.0
         return max(self.white / (1.0 - float(self.coefficients.sum())) ** 2, 1.0)
 
+    def scatter(self, kept: Array) -> float:
+        """Return the standard deviation behind a filter, whose autocorrelation is `kept`."""
+        lags = self.autocovariance(kept.size)
+        return math.sqrt(max(float(kept[0] * lags[0] + 2.0 * kept[1:] @ lags[1:]), 0.0))
+
     def times(self, columns: Array) -> Array:
         """Multiply the covariance matrix of n samples by the columns of an (n, k) array."""
         if not self.coefficients.size:
