@@ -46,6 +46,7 @@ def test_a_header_may_have_several_rows(
     tmp_path: Path, head: list[str], end: str, encoding: str
 ) -> None:
     lines = [line.replace("\n", end) for line in head]
+    lines[0] = f"\ufeff{lines[0]}"  # in utf-8-sig a second byte order mark
     test = read_test(written(tmp_path, [*lines, *ROWS], end, encoding))
     assert (test.rows.rows, test.rows.used) == (T.size, T.size)
     assert test.stress.max() == pytest.approx(2e6)

@@ -91,6 +91,7 @@ def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
             text = raw.decode("utf-16", "replace") if wide else raw.decode("utf-8-sig")
         except UnicodeDecodeError:
             text = raw.removeprefix(codecs.BOM_UTF8).decode("latin-1")
+        text = text.lstrip("\ufeff")  # a converted file may have several byte order marks
         if "\0" in text:
             raise InputError("is a binary file; it must be a text table (CSV) or .xlsx.")
     return Text(path, re.sub(r"\r*\n|\r", "\n", text) if "\r" in text else text, sha256)
@@ -332,6 +333,12 @@ def _checked_numbers(table: Table, columns: dict[str, int]) -> tuple[Array, Inte
             wrong = f"row {row} has {len(cells)} cells, but the header has {count}"
             raise InputError(f"{wrong}; every row must have as many as the header.")
         if not any(cells[k] for k in measured):
+            filled = list(filter(None, cells))
+            if len(filled) == 1 and _is_sample(re.split(r"[\s;|,]+", filled[0])):
+                raise InputError(
+                    f"row {row} has its numbers in one cell, {filled[0][:LONGEST]!r}; all rows "
+                    "must have the separator of the header and closed quotation marks."
+                )
             empty.append(row)
             continue
         wrongs = ((table.headers[k].text, _wrong(cells[k], table.decimal)) for k in places)
