@@ -25,7 +25,6 @@ _LEAST = 5e-3  # least residual of an outlier, as a share of the range
 _MOST = 0.02  # share of the samples: if more stand out, none is an outlier
 _FEWEST = 30  # samples of a record in which outliers can be found
 _WIDTH, _HALF = 9, 4  # samples of a local cubic, and on either side of its middle
-_EVEN = 0.02  # largest relative deviation of time steps that count as equal
 _PAUSE = 6.0  # a longer step, in usual steps, is a pause
 _OPEN = 0.1  # least share of a sample's deviation that remains in its residual
 _CHUNK = 50_000  # windows processed at once
@@ -64,15 +63,8 @@ def find_outliers(values: Array, time: Array | None = None) -> Mask:
     if n < _FEWEST:
         return np.zeros(n, dtype=bool)
     least = _LEAST * float(np.ptp(np.quantile(values, (0.005, 0.995))))
-    even, at = True, np.arange(n, dtype=np.float64)
-    if time is not None:
-        step = np.diff(time)
-        uneven = float(np.abs(step / np.median(step) - 1.0).max())
-        # Uneven steps do not matter if they hardly affect the values.
-        effect = uneven * float(np.quantile(np.abs(np.diff(values)), 0.99))
-        even = uneven <= _EVEN or effect < 0.1 * least
-        at = at if even else time
-    weights = _weights(at, even)
+    at = np.arange(n, dtype=np.float64) if time is None else time
+    weights = _weights(at)
     wrong = _gaps(values, at)
     for _ in range(4):  # a large spike hides small ones next to it
         smooth = _bridged(values, wrong, at)
@@ -114,12 +106,10 @@ def _spikes(values: Array, least: float, time: Array, weights: Array) -> Mask:
     """Find samples far from the cubic through their eight neighbours; see `_weights`."""
     from scipy.ndimage import maximum_filter1d
 
-    out, own = np.zeros(values.size, dtype=bool), weights[:, _HALF]
-    residual = np.einsum("ws,ws->w", weights, sliding_window_view(values, _WIDTH)) / np.where(
-        own, own, 1.0
-    )
-    usual = np.sqrt(robust_variance(residual * np.sqrt(own)) / np.where(own, own, 1.0))
-    size, own = np.abs(residual), np.broadcast_to(own, residual.shape)
+    out, own = np.zeros(values.size, dtype=bool), np.maximum(weights[:, _HALF], 1e-12)
+    residual = np.einsum("ws,ws->w", weights, sliding_window_view(values, _WIDTH)) / own
+    usual = np.sqrt(robust_variance(residual * np.sqrt(own)) / own)
+    size = np.abs(residual)
     # A spike also increases the residuals of its neighbours: only the largest of five is one.
     largest = size >= maximum_filter1d(size, 5, mode="constant")
     for i in np.flatnonzero((size > np.maximum(_OFF * usual, least)) & largest):
@@ -133,12 +123,12 @@ def _spikes(values: Array, least: float, time: Array, weights: Array) -> Mask:
     return out
 
 
-def _weights(time: Array, even: bool) -> Array:
-    """Return the weights (windows, samples) of "sample minus local cubic", one row if `even`.
+def _weights(time: Array) -> Array:
+    """Return the weights (windows, samples) of "sample minus local cubic".
 
     Weights are zero if the window spans a pause or the cubic depends on its middle sample alone.
     """
-    windows = sliding_window_view(time, _WIDTH)[: 1 if even else None]
+    windows = sliding_window_view(time, _WIDTH)
     weights = np.empty(windows.shape)
     for first in range(0, len(windows), _CHUNK):  # to limit memory
         x = windows[first : first + _CHUNK] - windows[first : first + _CHUNK, [_HALF]]
@@ -149,7 +139,7 @@ def _weights(time: Array, even: bool) -> Array:
     step = np.diff(time)
     pause = sliding_window_view(step, _WIDTH - 1).max(axis=1) > _PAUSE * float(np.median(step))
     untested = pause | (weights[:, _HALF] < _OPEN)
-    return np.where(untested[:, None], 0.0, weights) if untested.any() else weights
+    return np.where(untested[:, None], 0.0, weights)
 
 
 def bridge_outliers(record: Record) -> Record:

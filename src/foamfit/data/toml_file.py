@@ -23,7 +23,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from foamfit.data.measurement import GRAVITY, Noise, Specimen, Striker, Window, interior_node
+from foamfit.data.measurement import (
+    GRAVITY,
+    Entry,
+    Noise,
+    Specimen,
+    Striker,
+    Window,
+    interior_node,
+)
 from foamfit.data.units import (
     is_unit,
     parse_quantity,
@@ -257,27 +265,11 @@ MOTION_CHANNELS = "time", "displacement", "strain", "velocity"
 
 
 @dataclass(frozen=True)
-class Column:
-    """Entry of [columns] for one channel: header or number (from 1), unit and scale.
-
-    `spread` is the relative standard deviation of the scale; the values of a column that
-    `counts_down` decrease in compression.
-    """
-
-    column: str | int
-    unit: str | None = None
-    scale: float = 1.0
-    scale_unit: str = ""
-    counts_down: bool = False
-    spread: float = 0.0
-
-
-@dataclass(frozen=True)
 class Motion:
     """A motion with its own clock: time of the force = time of the motion + `delay`, s."""
 
     file: Path
-    columns: dict[str, Column]
+    columns: dict[str, Entry]
     delay: float = 0.0
 
 
@@ -290,7 +282,7 @@ class Settings:
     striker: Striker | None
     noise: Noise
     window: Window
-    columns: dict[str, Column] = field(default_factory=dict)
+    columns: dict[str, Entry] = field(default_factory=dict)
     duplicates: str = "average"
     sheet: str | None = None
     uncertainties: dict[str, float] = field(default_factory=dict)
@@ -411,9 +403,9 @@ _COLUMN: dict[str, Check] = {
 
 def _columns(
     table: dict[str, Any], channels: Iterable[str], name: str = "columns"
-) -> dict[str, Column]:
+) -> dict[str, Entry]:
     check_keys(f"[{name}]", table, [*channels, *filter(interior_node, table)])
-    columns: dict[str, Column] = {}
+    columns: dict[str, Entry] = {}
     right = '{ column = "Load", unit = "V" }, or with a number, column = 2'
     for channel, entry in table.items():
         where, inside = f"[{name}] {channel}", interior_node(channel) is not None
@@ -425,9 +417,8 @@ def _columns(
         number, unit, sigma = found.pop("scale", (1.0, "", None))
         if sigma is not None and (inside or channel in ("time", "cycle")):
             parse_quantity(entry["scale"], unit, f"{where}: scale", _SCALE)  # refuses the ±
-        columns[channel] = Column(
-            **found, scale=number, scale_unit=unit, spread=(sigma or 0.0) / abs(number)
-        )
+        spread = (sigma or 0.0) / abs(number)
+        columns[channel] = Entry(channel, **found, scale=number, scale_unit=unit, spread=spread)
     return columns
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from foamfit.arrays import Array, Integers
-from foamfit.data.measurement import MIN_ROWS, Dropped, entry_line
+from foamfit.data.measurement import MIN_ROWS, Dropped, Entry
 from foamfit.data.tables.headers import CHANNELS, Header, parse_header
 from foamfit.data.tables.layouts import blanks_as_tabs, scope_of, unpacked
 from foamfit.data.toml_file import LONGEST, read_bytes
@@ -184,10 +184,8 @@ def _above_numbers(grids: dict[str, list[list[str]]], names: set[str | int]) -> 
             return separator, above[-1]
         if any(isinstance(name, int) for name in names):
             return separator, -1
-        entries = ", ".join(
-            entry_line(c, str(k), CHANNELS[c].unit)
-            for k, c in enumerate(("time", "force", "displacement"), 1)
-        )
+        channels = enumerate(("time", "force", "displacement"), 1)
+        entries = ", ".join(str(Entry(c, k, CHANNELS[c].unit)) for k, c in channels)
         shown = ", ".join(grid[rows[0]])[:LONGEST]
         raise InputError(
             f"no row names the columns above row {rows[0] + 1}, {shown!r}; give their numbers in "
