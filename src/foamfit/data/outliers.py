@@ -388,10 +388,7 @@ def _follows(
     fitted = np.arange(min((before + end) // 2, end - 5), end)
     middle = float(fitted.mean())
     slope, level = np.polyfit(fitted - middle, stress[fitted], 1)
-    scatter = float(np.std(stress[fitted] - level - slope * (fitted - middle)))
     ahead = float(window.mean()) - middle
-    shares = 1.0 / window.size, 1.0 / fitted.size, ahead**2 / np.sum((fitted - middle) ** 2)
-    error = max(noise_level(stress[before : last + 1]), scatter) * np.sqrt(sum(shares))
     slopes = []  # stiffnesses before and after, Pa/m; the smaller one is used
     for sides in (slice(before, None, -1), slice(after, None)):
         motion, force = w[sides], stress[sides]
@@ -404,7 +401,6 @@ def _follows(
     return bool(
         expected < _FELT * float(np.ptp(stress))
         or change > _FOLLOWS * expected
-        or expected - change < _SURE * error
     )
 
 
