@@ -45,7 +45,6 @@ _CONTACT = 0.1  # least stress in contact, as a share of its range
 _CHANGE = 0.005  # least change of stress while the gauge is stuck, likewise
 _FELT = 0.004  # least change of stress that a real motion like the jump would cause, likewise
 _FOLLOWS = 0.5  # share of that change: if the stress changes more, the jump is real
-_SURE = 3.0  # standard errors for a significant change of stress
 _AROUND = 3.0  # the stiffness is that over this many jumps on either side
 
 
@@ -334,9 +333,7 @@ def find_standstills(record: Record) -> list[tuple[int, int]]:
         if last + 1 - before < shortest:
             continue
         meanwhile = stress[before : last + 1]
-        change, part = _change(meanwhile)
-        error = noise_level(meanwhile) * np.sqrt(2.0 / part)
-        changed = abs(change) >= max(_CHANGE * size, _SURE * error)
+        changed = abs(_change(meanwhile)) >= _CHANGE * size
         loaded = np.median(meanwhile) - low >= _CONTACT * size
         if changed and loaded and not _follows(w, stress, noise, step, before, last, after):
             found.append((before, after))
@@ -365,11 +362,11 @@ def _jumps(w: Array, noise: float, step: int, width: int) -> dict[int, int]:
     return found
 
 
-def _change(stress: Array) -> tuple[float, int]:
-    """Return the final rise or fall of a stress, and the number of samples averaged for it."""
+def _change(stress: Array) -> float:
+    """Return the final rise or fall of a stress."""
     part = max(stress.size // 4, _SAMPLES // 2)
     mean = np.convolve(stress, np.full(part, 1.0 / part), "valid")
-    return max(float(mean[-1] - mean.min()), float(mean[-1] - mean.max()), key=abs), part
+    return max(float(mean[-1] - mean.min()), float(mean[-1] - mean.max()), key=abs)
 
 
 def _follows(
@@ -386,9 +383,7 @@ def _follows(
     window = after + np.arange(int(np.argmax(away)) if away.any() else rest.size)
     end = last + 1 - (step if step > 1 else 0)
     fitted = np.arange(min((before + end) // 2, end - 5), end)
-    middle = float(fitted.mean())
-    slope, level = np.polyfit(fitted - middle, stress[fitted], 1)
-    ahead = float(window.mean()) - middle
+    ahead = np.polyval(np.polyfit(fitted, stress[fitted], 1), window.mean())
     slopes = []  # stiffnesses before and after, Pa/m; the smaller one is used
     for sides in (slice(before, None, -1), slice(after, None)):
         motion, force = w[sides], stress[sides]
@@ -397,11 +392,8 @@ def _follows(
             change = float(force[far : far + 5].mean() - force[:5].mean())
             slopes.append(change / float(motion[far] - motion[0]))
     expected = max(min(slopes, default=0.0), 0.0) * abs(jump)
-    change = (float(stress[window].mean()) - level - slope * ahead) * np.sign(jump)
-    return bool(
-        expected < _FELT * float(np.ptp(stress))
-        or change > _FOLLOWS * expected
-    )
+    change = float(stress[window].mean() - ahead) * np.sign(jump)
+    return bool(expected < _FELT * float(np.ptp(stress)) or change > _FOLLOWS * expected)
 
 
 def bridge_standstills(record: Record, found: list[tuple[int, int]], height: float) -> Record:
@@ -412,7 +404,7 @@ def bridge_standstills(record: Record, found: list[tuple[int, int]], height: flo
     standstills = dict[str, Mask]()
     for before, after in found:
         stress = record.stress[before:after]
-        change = _change(stress)[0] / float(np.abs(stress).max())
+        change = _change(stress) / float(np.abs(stress).max())
         jump, inside, ends = w[after] - w[before], slice(before + 1, after), [before, after]
         w[inside] = np.interp(time[inside], time[ends], w[ends])
         note = (

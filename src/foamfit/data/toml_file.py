@@ -256,7 +256,11 @@ _PRIOR = Rule(lambda v: isinstance(v, str), 'like "5.5 ± 0.1 MPa"')
 _FILE = Rule(
     lambda v: isinstance(v, str) and v.strip() != "" and "\0" not in v, 'a file, like "camera.csv"'
 )
-_DELAY = Quantity("s", "0 ± 50 us", positive=False, uncertain=True)
+_MOTION: dict[str, Check] = {
+    "file": _FILE,
+    "delay": Quantity("s", "0 ± 50 us", positive=False, uncertain=True),
+    "columns": anything,
+}
 # Names in `Settings.uncertainties` that differ from the key.
 _SPREADS = {"specimen mass": "specimen_mass", "striker mass": "striker_mass"}
 _SCALE = "4444.4 N/V"
@@ -380,11 +384,9 @@ def _motion(path: Path, document: dict[str, Any]) -> tuple[Motion | None, float 
     """Return the motion in a file of its own, and the standard deviation of its delay, s."""
     if "motion" not in document:
         return None, None
-    table = document["motion"]
-    if not isinstance(table, dict) or "file" not in table:
-        raise InputError('[motion] must name a file, like file = "camera.csv".')
-    keys: dict[str, Check] = {"file": _FILE, "delay": _DELAY, "columns": anything}
-    found = {"delay": Stated(0.0, None)} | checked(table, keys, "[motion]")
+    found = {"delay": Stated(0.0, None)} | checked(
+        table_of(document, "motion"), _MOTION, "[motion]", ["file"]
+    )
     columns = _columns(table_of(found, "columns", "motion."), MOTION_CHANNELS, "motion.columns")
     delay = found["delay"]
     return Motion(path.parent / found["file"], columns, delay.value), delay.sigma
@@ -409,11 +411,9 @@ def _columns(
     right = '{ column = "Load", unit = "V" }, or with a number, column = 2'
     for channel, entry in table.items():
         where, inside = f"[{name}] {channel}", interior_node(channel) is not None
-        if not isinstance(entry, dict) or "column" not in entry:
-            raise InputError(f"{where} must be like {right}.")
         down = inside or channel == "displacement"
         keys = _COLUMN if down else {key: _COLUMN[key] for key in ("column", "unit", "scale")}
-        found = checked(entry, keys, f"{where}:")
+        found = Table(keys, right, ("column",))(entry, where)
         number, unit, sigma = found.pop("scale", (1.0, "", None))
         if sigma is not None and (inside or channel in ("time", "cycle")):
             parse_quantity(entry["scale"], unit, f"{where}: scale", _SCALE)  # refuses the ±
