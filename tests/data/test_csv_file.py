@@ -147,9 +147,9 @@ def test_a_quotient_of_two_quantities_is_no_channel(tmp_path, other):
 @pytest.mark.parametrize(
     ("header", "words"),
     [
-        ("time (ms),stress (furlong),displacement (mm)", ["stress (furlong)", "wrong dimension"]),
         ("time (ms),stress (xyz),displacement (mm)", ["unknown unit 'xyz'", "stress (MPa)"]),
         ("time (ms),force (mm),displacement (mm)", ["force (mm)", "wrong dimension"]),
+        ("time (ms),stress (kPa) (MPa),displacement (mm)", ["unknown unit 'kPa or MPa'"]),
         ("time,stress (MPa),displacement (mm)", ["'time' has no unit", "time (ms)", "[columns]"]),
         ("time (ms),stress,displacement (mm)", ["'stress' has no unit"]),
         ("time (ms),torque (mm),displacement (mm)", ["no column is a stress or a force"]),
@@ -171,6 +171,7 @@ def test_refuses_headers(tmp_path, header, words):
         ("7,1,NaN", ["row 9", "'displacement (mm)'", "finite"]),
         ("7,inf,1", ["row 9", "'stress (MPa)'", "finite"]),
         ("7,1,1,1", ["row 9", "4 cells", "3"]),
+        ("7;1;1", ["row 9", "one cell"]),
         ("5,1,1", ["row 9", "'time (ms)'", "goes back"]),
         ("6,1,1", ["row 9", "'time (ms)'", "repeats", 'duplicates = "average"']),
         ("7,1_000,1", ["row 9", "'1_000'", "without separators, 1000"]),

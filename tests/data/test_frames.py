@@ -185,7 +185,7 @@ def test_a_motion_is_no_test_of_its_own(tmp_path):
         ("[motion]\nfile = 3\n", ["test.toml: [motion] file = 3 must be a file"]),
         ('[motion]\nfile = "a\\u0000"\n', ["test.toml: [motion] file", "must be a file"]),
         ('[motion]\nfile = "."\n', ["cannot be read", "[motion] file of test.toml"]),
-        ('[motion]\ndelay = "1 us"\n', ["[motion] must name a file"]),
+        ('[motion]\ndelay = "1 us"\n', ["[motion] file is missing; it must be a file, like"]),
         ('[motion]\nfile = "test.csv"\n', ["test.toml: [motion] file", "is the file of the force"]),
         (MOTION + 'shift = "1 us"\n', ["[motion] has no key 'shift'"]),
         (MOTION + "delay = 5\n", ["[motion] delay = 5 is not a quantity"]),

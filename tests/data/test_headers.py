@@ -37,7 +37,7 @@ def written(folder: Path, lines: list[str], end: str = "\n", encoding: str = "ut
         [NAMES, "s,N,mm", "-----,-----,-----"],
         ["s,N,mm", NAMES],
         [FIRST, "s,N,mm", NAMES],
-        ['"Time\n(s)","Force\n(N)","Displacement\n(mm)"'],
+        ['\ufeff"Time\n(s)","Force\n(N)","Displacement\n(mm)"'],
         [FIRST, '"Time\n(s)","Force\n\n(N)",Displacement / mm'],
     ],
 )

@@ -130,7 +130,7 @@ def _of_force(test: Measurement, ratio: float, limit: float, mass: float) -> Con
     what = "acceleration" if test.braked else "force"
     says = f"the impulse of the {what} is {1.0 / ratio:.2f} of the change of momentum in the "
     says += f"motion, so {'' if test.braked else 'mass, '}scale of the {what} and motion disagree"
-    entry = test.entries.get("stress", Entry(what, '"…"'))
+    entry = test.entries.get("stress", Entry(what))
     lines = [(entry.table, entry.times(ratio, TENTH * limit))]
     if not test.braked:  # otherwise the mass cancels
         lines.append(("striker", f'mass = "{engineering(1e3 * mass / ratio, "g")}"'))
@@ -142,7 +142,7 @@ def _of_force(test: Measurement, ratio: float, limit: float, mass: float) -> Con
 def _of_motion(test: Measurement, ratio: float, limit: float) -> Contradiction:
     """Return the contradiction between the scale of the motion and all else."""
     says = f"the motion is {ratio:.2f} times as large as mass, velocity and force imply"
-    entry = test.entries.get("displacement", Entry("displacement", '"…"'))
+    entry = test.entries.get("displacement", Entry("displacement"))
     line = entry.table, entry.times(1.0 / ratio, TENTH * limit)
     return Contradiction("motion_scale", 1.0 / ratio, limit, says, (line,))
 

@@ -17,7 +17,6 @@ from foamfit.data.noise import MIN_REST, level_on_line, noise_about, smooth
 # mistaken for rest. The limit is larger for a motion, and for an impact, whose fit refines it.
 STILL, _STILL_IMPACT, STILL_MOTION = 0.15, 0.3, 0.5
 _ERRORS = 2.0  # standard errors added to the slope at rest
-_ERRORS_AWAY = 1.0  # the same if a motion starts away from zero, probably before contact
 # Largest drift of an impact's stress at rest, as a share of the peak: without a motion; if the
 # motion starts at zero (a rising stress is then contact); and if it starts away from zero, unless
 # there is no other rest.
@@ -131,11 +130,10 @@ def leave_rest(
     noise: NoiseLevel,
     still: float = STILL,
     drift: float = np.inf,
-    errors: float = _ERRORS,
 ) -> Kink | None:
     """Find where a signal leaves its rest; None if there is no rest before the rise.
 
-    A line is extrapolated back from the first part of the rise. At rest the slope, plus `errors`
+    A line is extrapolated back from the first part of the rise. At rest the slope, plus two
     standard errors, is less than a share `still` of the mean slope up to 15 % of the peak, and the
     signal does not change significantly by more than `drift`. A kink within a rise is skipped.
     """
@@ -152,7 +150,7 @@ def leave_rest(
         high = high if t[high] > at else int(np.argmax(y))
         after = float(y[high : high + 3].mean() - rest) / (t[high] - at)
         changed = (size - _ERRORS * error) * (t[n - 1] - t[0])
-        if size + errors * error < still * after and changed <= drift:
+        if size + _ERRORS * error < still * after and changed <= drift:
             return found
         rows = n
     return None
@@ -185,8 +183,7 @@ def start_of_impact(record: Record, levels: Levels) -> Start:
         elsewhere = _first_motion(time, w, levels["displacement"])[1]
         drift = _DRIFT_AWAY if elsewhere else _DRIFT_AT_ZERO
     if "stress" not in record.derived:
-        errors = _ERRORS_AWAY if elsewhere else _ERRORS
-        leaves = partial(leave_rest, time, stress, levels["stress"], _STILL_IMPACT, errors=errors)
+        leaves = partial(leave_rest, time, stress, levels["stress"], _STILL_IMPACT)
         at = leaves(drift * float(np.ptp(stress))) or (leaves() if elsewhere else None)
     start = _at_kink("stress", time, at, "stress") if at else _first_sample(record, levels)
     if w is None:

@@ -38,7 +38,7 @@ from foamfit.data.tables.columns import TWINS, Source, si_factor
 from foamfit.data.tables.csv_table import read_numbers, read_text
 from foamfit.data.tables.draft import without_toml
 from foamfit.data.tables.headers import CHANNELS, example
-from foamfit.data.toml_file import RANGE, Column, Settings, read_settings, toml_beside
+from foamfit.data.toml_file import RANGE, Settings, read_settings, toml_beside
 from foamfit.errors import InputError, naming
 from foamfit.text import engineering, percent
 
@@ -156,7 +156,7 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
         numbers, rows, _ = read_numbers(source.table, source.columns)
         check_time(numbers["time"], source.name("time"), rows)
         for name, k in source.columns.items():
-            in_si = None if headers[k].unit else Column(headers[k].text, CHANNELS[name].si)
+            in_si = None if headers[k].unit else Entry(name, headers[k].text, CHANNELS[name].si)
             numbers[name] *= si_factor(source.table, name, k, in_si)
     return numbers["time"], numbers[channel]
 

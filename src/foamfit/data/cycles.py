@@ -33,6 +33,7 @@ _BEGUN = 3.0  # multiple of the least load above which the first rise has certai
 _AT_PEAK = 3.0  # samples within this many standard deviations below the largest may be the peak
 _CLOSE = 0.95  # share of the peak; a motion is held if it takes longer from there than up to there
 _COPIES = 30  # number of copies with additional noise
+_FINE = 20  # points per sample of a fitted motion
 _NORMAL = 0.6745  # median magnitude of a standard normal variable
 
 
@@ -331,23 +332,17 @@ def loading_rate(test: Measurement, fitted: Array | None = None) -> float | None
     The peak is the middle of the samples that may be the largest in view of the noise, or the start
     of a hold. If given, the `fitted` displacement (m) is used instead; it has no noise.
     """
+    from scipy.interpolate import CubicSpline
+
     if test.time is None or test.displacement is None:
         return None
-    time = test.time - test.time[0]
-    if fitted is None:
-        noise = test.noise.of("displacement")
-        velocity = _velocity(time, test.displacement, noise.sigma if noise else 0.0)
-        return None if velocity is None else velocity / test.specimen.height
-    motion, at = fitted - fitted[0], int(np.argmax(fitted))
-    if motion[at] <= 0.0 or time[at] <= 0.0:
-        return None
-    # The peak of a smooth motion lies between samples.
-    at = int(np.clip(at, 1, motion.size - 2))
-    near = slice(at - 1, at + 2)
-    t = time[near] - time[at]
-    bend, slope, most = np.polyfit(t, motion[near], 2)
-    apex = float(np.clip(-slope / (2.0 * bend), t[0], t[2])) if bend < 0.0 else 0.0
-    return float((most + 0.5 * slope * apex) / (time[at] + apex)) / test.specimen.height
+    time, motion, noise = test.time - test.time[0], test.displacement, test.noise.of("displacement")
+    sigma = noise.sigma if noise else 0.0
+    if fitted is not None:  # the peak of a smooth motion lies between samples
+        fine = np.linspace(0.0, time[-1], _FINE * time.size)
+        time, motion, sigma = fine, CubicSpline(time, fitted)(fine), 0.0
+    velocity = _velocity(time, motion, sigma)
+    return None if velocity is None else velocity / test.specimen.height
 
 
 def rate_error(test: Measurement) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -124,36 +125,40 @@ class Dropped:
         return f"{part}rows {self.first} to {self.last} ({self.rows}): {self.why}"
 
 
-def entry_line(
-    channel: str, column: str, unit: str | None = None, scale: str = "", counts_down: bool = False
-) -> str:
-    """Return a line of [columns]; `column` and `scale` are written as in the TOML."""
-    more = f', unit = "{unit}"' if unit else ""
-    more += f", scale = {scale}" if scale else ""
-    return f"{channel} = {{ column = {column}{more}{', counts_down = true' * counts_down} }}"
-
-
 @dataclass(frozen=True)
 class Entry:
-    """Entry of [columns] by which a channel is read: `column` is written as in the TOML.
+    """Entry of [columns] for one channel: header or number (from 1) of a column, unit and scale.
 
-    With `inverse`, the scale is a sensitivity, such as "2 mV/N".
+    With `inverse`, the scale is a sensitivity, such as "2 mV/N"; `spread` is its relative standard
+    deviation. The values of a column that `counts_down` decrease in compression. `table` is the
+    section of the TOML.
     """
 
     channel: str
-    column: str
+    column: str | int = "…"
     unit: str | None = None
     scale: float = 1.0
     scale_unit: str = ""
-    inverse: bool = False
     counts_down: bool = False
+    spread: float = 0.0
+    inverse: bool = False
     table: str = "columns"
+
+    def __str__(self) -> str:
+        """Return the line of the TOML."""
+        return self._line(f"{self.scale:.12g}" if self.scale != 1.0 or self.scale_unit else "")
+
+    def _line(self, scale: str) -> str:
+        scale = f'"{scale} {self.scale_unit}"' if self.scale_unit else scale
+        more = f', unit = "{self.unit}"' * bool(self.unit) + f", scale = {scale}" * bool(scale)
+        column = json.dumps(self.column, ensure_ascii=False) + more
+        return (
+            f"{self.channel} = {{ column = {column}{', counts_down = true' * self.counts_down} }}"
+        )
 
     def times(self, factor: float, within: float) -> str:
         """Return the line for a channel larger by a factor, rounded `within` a share of it."""
-        scale = rounded(self.scale * factor ** (-1.0 if self.inverse else 1.0), within)
-        scale = f'"{scale} {self.scale_unit}"' if self.scale_unit else scale
-        return entry_line(self.channel, self.column, self.unit, scale, self.counts_down)
+        return self._line(rounded(self.scale * factor ** (-1.0 if self.inverse else 1.0), within))
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from foamfit.data.measurement import GRAVITY, Noise, Specimen, Striker, Window, interior_node
+from foamfit.data.measurement import (
+    GRAVITY,
+    Entry,
+    Noise,
+    Specimen,
+    Striker,
+    Window,
+    interior_node,
+)
 from foamfit.data.units import (
     is_unit,
     parse_quantity,
@@ -248,7 +256,11 @@ _PRIOR = Rule(lambda v: isinstance(v, str), 'like "5.5 ± 0.1 MPa"')
 _FILE = Rule(
     lambda v: isinstance(v, str) and v.strip() != "" and "\0" not in v, 'a file, like "camera.csv"'
 )
-_DELAY = Quantity("s", "0 ± 50 us", positive=False, uncertain=True)
+_MOTION: dict[str, Check] = {
+    "file": _FILE,
+    "delay": Quantity("s", "0 ± 50 us", positive=False, uncertain=True),
+    "columns": anything,
+}
 # Names in `Settings.uncertainties` that differ from the key.
 _SPREADS = {"specimen mass": "specimen_mass", "striker mass": "striker_mass"}
 _SCALE = "4444.4 N/V"
@@ -257,27 +269,11 @@ MOTION_CHANNELS = "time", "displacement", "strain", "velocity"
 
 
 @dataclass(frozen=True)
-class Column:
-    """Entry of [columns] for one channel: header or number (from 1), unit and scale.
-
-    `spread` is the relative standard deviation of the scale; the values of a column that
-    `counts_down` decrease in compression.
-    """
-
-    column: str | int
-    unit: str | None = None
-    scale: float = 1.0
-    scale_unit: str = ""
-    counts_down: bool = False
-    spread: float = 0.0
-
-
-@dataclass(frozen=True)
 class Motion:
     """A motion with its own clock: time of the force = time of the motion + `delay`, s."""
 
     file: Path
-    columns: dict[str, Column]
+    columns: dict[str, Entry]
     delay: float = 0.0
 
 
@@ -290,7 +286,7 @@ class Settings:
     striker: Striker | None
     noise: Noise
     window: Window
-    columns: dict[str, Column] = field(default_factory=dict)
+    columns: dict[str, Entry] = field(default_factory=dict)
     duplicates: str = "average"
     sheet: str | None = None
     uncertainties: dict[str, float] = field(default_factory=dict)
@@ -388,11 +384,9 @@ def _motion(path: Path, document: dict[str, Any]) -> tuple[Motion | None, float 
     """Return the motion in a file of its own, and the standard deviation of its delay, s."""
     if "motion" not in document:
         return None, None
-    table = document["motion"]
-    if not isinstance(table, dict) or "file" not in table:
-        raise InputError('[motion] must name a file, like file = "camera.csv".')
-    keys: dict[str, Check] = {"file": _FILE, "delay": _DELAY, "columns": anything}
-    found = {"delay": Stated(0.0, None)} | checked(table, keys, "[motion]")
+    found = {"delay": Stated(0.0, None)} | checked(
+        table_of(document, "motion"), _MOTION, "[motion]", ["file"]
+    )
     columns = _columns(table_of(found, "columns", "motion."), MOTION_CHANNELS, "motion.columns")
     delay = found["delay"]
     return Motion(path.parent / found["file"], columns, delay.value), delay.sigma
@@ -411,23 +405,20 @@ _COLUMN: dict[str, Check] = {
 
 def _columns(
     table: dict[str, Any], channels: Iterable[str], name: str = "columns"
-) -> dict[str, Column]:
+) -> dict[str, Entry]:
     check_keys(f"[{name}]", table, [*channels, *filter(interior_node, table)])
-    columns: dict[str, Column] = {}
+    columns: dict[str, Entry] = {}
     right = '{ column = "Load", unit = "V" }, or with a number, column = 2'
     for channel, entry in table.items():
         where, inside = f"[{name}] {channel}", interior_node(channel) is not None
-        if not isinstance(entry, dict) or "column" not in entry:
-            raise InputError(f"{where} must be like {right}.")
         down = inside or channel == "displacement"
         keys = _COLUMN if down else {key: _COLUMN[key] for key in ("column", "unit", "scale")}
-        found = checked(entry, keys, f"{where}:")
+        found = Table(keys, right, ("column",))(entry, where)
         number, unit, sigma = found.pop("scale", (1.0, "", None))
         if sigma is not None and (inside or channel in ("time", "cycle")):
             parse_quantity(entry["scale"], unit, f"{where}: scale", _SCALE)  # refuses the ±
-        columns[channel] = Column(
-            **found, scale=number, scale_unit=unit, spread=(sigma or 0.0) / abs(number)
-        )
+        spread = (sigma or 0.0) / abs(number)
+        columns[channel] = Entry(channel, **found, scale=number, scale_unit=unit, spread=spread)
     return columns
 
 

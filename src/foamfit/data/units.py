@@ -37,8 +37,9 @@ def _unit(text: str) -> Any:
     text = re.sub(r"(?<=[A-Za-z])(-?\d)", r"**\1", text)  # m/s2
     if text in {"-", "–", "1"}:
         text = ""
+    registry = _registry()
     try:
-        return _registry().Quantity(1.0, _registry().parse_units(text))
+        return registry.Quantity(1.0, registry.parse_units(text))
     except Exception:  # pint and its tokenizer raise many different exceptions
         return None
 

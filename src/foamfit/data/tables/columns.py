@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from foamfit.data.measurement import Entry, Striker, entry_line, interior_channel, interior_node
+from foamfit.data.measurement import Entry, Striker, interior_channel, interior_node
 from foamfit.data.tables.csv_table import Table, Text, find_table, read_numbers
 from foamfit.data.tables.headers import CHANNELS, WEAK, WEIGHTS, channel_of, example, in_si
-from foamfit.data.toml_file import Column, Settings
+from foamfit.data.toml_file import Settings
 from foamfit.data.units import is_unit
 from foamfit.errors import InputError
 from foamfit.text import listed, percent
 
-_NONE = Column("")
 _MOTIONS = "displacement", "strain"
 TWINS = {"stress": "force", "force": "stress", "displacement": "strain", "strain": "displacement"}
 # Channels that stress and displacement are read from, the preferred one first.
@@ -29,11 +27,11 @@ class Source:
 
     table: Table
     columns: dict[str, int]
-    given: dict[str, Column]
+    given: dict[str, Entry]
 
     @classmethod
     def of(
-        cls, text: Text, given: dict[str, Column], unclear: dict[str, list[int]] | None = None
+        cls, text: Text, given: dict[str, Entry], unclear: dict[str, list[int]] | None = None
     ) -> Source:
         """Find the table in the text of a file and the columns of the channels.
 
@@ -55,6 +53,10 @@ class Source:
     def measure(self, channel: str) -> str:
         """Return the measure of strain or stress that a header names, "" if engineering."""
         return self.table.headers[self.columns[channel]].measure(channel)
+
+    def entry(self, channel: str) -> Entry:
+        """Return the entry of [columns] for a channel, without a column if there is none."""
+        return self.given.get(channel, Entry(channel))
 
     def only(self, channels: Iterable[str]) -> Source:
         """Return a source with these channels only."""
@@ -133,7 +135,7 @@ class Source:
         used = {n: next((c for c in cs if c in self.columns), "") for n, cs in sources.items()}
         if used["stress"] == "acceleration":  # then acceleration is not a separate channel
             del used["acceleration"]
-        spreads = {f"{name}_scale": self.given.get(c, _NONE).spread for name, c in used.items()}
+        spreads = {f"{name}_scale": self.entry(c).spread for name, c in used.items()}
         return {name: spread for name, spread in spreads.items() if spread}
 
     def entries(self, table: str) -> dict[str, Entry]:
@@ -142,22 +144,21 @@ class Source:
         for name, channels in _SOURCES.items():
             channel = next((c for c in channels if c in self.columns), None)
             if channel is not None:
-                k, one = self.columns[channel], self.given.get(channel, _NONE)
-                unit = one.unit or self.table.headers[k].unit or ""
-                over, column = _inverse(channel, unit, one) is not None, quoted(self.table, k)
-                scale = one.scale, one.scale_unit, over, one.counts_down
-                found[name] = Entry(channel, column, one.unit, *scale, table)
+                k, one = self.columns[channel], self.entry(channel)
+                over = _inverse(one, one.unit or self.table.headers[k].unit or "") is not None
+                column = column_of(self.table, k)
+                found[name] = replace(one, column=column, inverse=over, table=table)
         return found
 
     def note(self) -> str:
         """Return a note with the column of each channel and the unused columns."""
         parts, table = [], self.table
         for channel, k in self.columns.items():
-            given, header = self.given.get(channel, _NONE), table.headers[k]
+            given, header = self.entry(channel), table.headers[k]
             unit = given.unit or header.unit or ""
             by = f"{given.scale:.6g} {given.scale_unit}".strip()
             by += f" ± {percent(given.spread)}" if given.spread else ""
-            over = _inverse(channel, unit, given) is not None
+            over = _inverse(given, unit) is not None
             part = f"{channel} from {table.name(k)}" + (f" in {given.unit}" if given.unit else "")
             part += f" {'over the sensitivity' if over else 'times'} {by}" if by != "1" else ""
             part += ", counting down" if given.counts_down else ""
@@ -168,22 +169,22 @@ class Source:
         rest = [repr(h.text) for k, h in enumerate(table.headers) if h.text and k not in used]
         return f"Read {', '.join(parts)}" + (f"; not used: {', '.join(rest)}." if rest else ".")
 
-    def sign_entry(self, channel: str) -> str:
+    def sign_entry(self, channel: str) -> Entry:
         """Return the entry of the TOML that reverses the sign of a channel."""
-        given = self.given.get(channel, _NONE)
-        by = f'"{-given.scale:g} {given.scale_unit}"' if given.scale_unit else f"{-given.scale:g}"
-        down, column = channel.startswith("displacement"), quoted(self.table, self.columns[channel])
-        return entry_line(channel, column, scale="" if down else by, counts_down=down)
+        given = replace(self.entry(channel), column=column_of(self.table, self.columns[channel]))
+        if channel.startswith("displacement"):
+            return replace(given, counts_down=True)
+        return replace(given, scale=-given.scale)
 
     def stated_sign(self, channel: str) -> str:
         """Return what reverses the sign of a channel in the TOML; "" if nothing does."""
-        given = self.given.get(channel, _NONE)
+        given = self.entry(channel)
         minus = f"the minus sign of scale = {given.scale:g}" if given.scale < 0.0 else ""
         return "counts_down = true" if given.counts_down else minus
 
 
 def assign_columns(
-    table: Table, given: dict[str, Column], unclear: dict[str, list[int]] | None = None
+    table: Table, given: dict[str, Entry], unclear: dict[str, list[int]] | None = None
 ) -> dict[str, int]:
     """Return the column number of each channel, from [columns] or else from the headers.
 
@@ -209,7 +210,7 @@ def assign_columns(
             continue
         if unclear is None:
             both = " and ".join(map(table.name, best))
-            entry = entry_line(channel, quoted(table, best[0]))
+            entry = Entry(channel, column_of(table, best[0]))
             raise InputError(
                 f"columns {both} could both be the {channel}; keep one, or write {entry} in "
                 "[columns]."
@@ -234,7 +235,7 @@ def _best(table: Table, channel: str, ranks: dict[int, int]) -> list[int]:
     return _clear_time(table, best) if len(best) > 1 and channel == "time" else best
 
 
-def _channels(table: Table, given: dict[str, Column]) -> list[str]:
+def _channels(table: Table, given: dict[str, Entry]) -> list[str]:
     """List the channels to look for: the usual ones, then those of interior masses."""
     numbers = {int(w) for h in table.headers for w in h.words if w.isdecimal()}
     inside = {c for c in (*map(interior_channel, numbers), *given) if interior_node(c)}
@@ -256,11 +257,11 @@ def _place(table: Table, channel: str, column: str | int) -> int:
     raise InputError(f"[columns] {channel}: column {column!r} is {more}.")
 
 
-def quoted(table: Table, k: int) -> str:
+def column_of(table: Table, k: int) -> str | int:
     """Return a column as written in [columns]: its header, or its number if not unique."""
     text = table.headers[k].text
     unique = table.header_row and [h.text for h in table.headers].count(text) == 1
-    return json.dumps(text, ensure_ascii=False) if unique else str(k + 1)
+    return text if unique else k + 1
 
 
 def _clear_time(table: Table, columns: list[int]) -> list[int]:
@@ -274,9 +275,9 @@ def _clear_time(table: Table, columns: list[int]) -> list[int]:
     return rising if len(rising) == 1 else columns
 
 
-def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float:
+def si_factor(table: Table, channel: str, k: int, given: Entry | None) -> float:
     """Return the factor from the numbers of column `k` to SI."""
-    header, given = table.headers[k], given or _NONE
+    header, given = table.headers[k], given or Entry(channel)
     if channel == "cycle":  # a count; pint would read "Cycles" in a header as a unit of angle
         return 1.0
     right, where = example(channel), f"column {table.name(k)}"
@@ -290,12 +291,11 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
     if unit is None and over and in_si(channel, over, given.scale_unit) is not None:
         unit = over
     if unit is None and in_si(channel, "", given.scale_unit) is None:
-        usual, scale = channel_of(channel).unit, ""
+        usual = channel_of(channel).unit
         if given.scale_unit:
             over, _, under = given.scale_unit.rpartition("/")
             usual = under if in_si(channel, under) is None else over  # of N/mV or mV/N
-            scale = f'"{given.scale:g} {given.scale_unit}"'
-        entry = entry_line(channel, quoted(table, k), usual, scale)
+        entry = replace(given, column=column_of(table, k), unit=usual)
         raise InputError(
             f"{where} has no unit; write it in the header like '{right}' or in [columns] like "
             f"{entry}."
@@ -314,7 +314,7 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
                 f"{where} has the unit {own!r} in its header, but [columns] {channel} says "
                 f"{given.unit!r}; leave unit out, or, if the header is wrong, correct it by scale."
             )
-    si, inverse = in_si(channel, unit, given.scale_unit), _inverse(channel, unit, given)
+    si, inverse = in_si(channel, unit, given.scale_unit), _inverse(given, unit)
     si = inverse / given.scale**2 if inverse is not None else si
     if si is None:
         raise InputError(
@@ -324,11 +324,11 @@ def si_factor(table: Table, channel: str, k: int, given: Column | None) -> float
     return given.scale * si * (-1.0 if given.counts_down else 1.0)
 
 
-def _inverse(channel: str, unit: str, given: Column) -> float | None:
+def _inverse(given: Entry, unit: str) -> float | None:
     """Return the factor to SI if the scale is a sensitivity such as "4 mV/N", else None."""
-    if not given.scale_unit or in_si(channel, unit, given.scale_unit) is not None:
+    if not given.scale_unit or in_si(given.channel, unit, given.scale_unit) is not None:
         return None
-    return in_si(channel, unit, f"1/({given.scale_unit})")
+    return in_si(given.channel, unit, f"1/({given.scale_unit})")
 
 
 def entries_of(table: Table, has: set[str], *channels: str) -> str:
@@ -337,7 +337,7 @@ def entries_of(table: Table, has: set[str], *channels: str) -> str:
     for channel in (c for c in channels if c not in has):
         fits = [k for k, header in headers if in_si(channel, header.unit or "") is not None]
         if len(fits) == 1:
-            entries.append(entry_line(channel, quoted(table, fits[0])))
+            entries.append(str(Entry(channel, column_of(table, fits[0]))))
         else:
-            entries.append(entry_line(channel, '"…"', channel_of(channel).unit))
+            entries.append(str(Entry(channel, unit=channel_of(channel).unit)))
     return listed(entries)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from foamfit.arrays import Array, Integers
-from foamfit.data.measurement import MIN_ROWS, Dropped, entry_line
+from foamfit.data.measurement import MIN_ROWS, Dropped, Entry
 from foamfit.data.tables.headers import CHANNELS, Header, parse_header
 from foamfit.data.tables.layouts import blanks_as_tabs, scope_of, unpacked
 from foamfit.data.toml_file import LONGEST, read_bytes
@@ -91,6 +91,7 @@ def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
             text = raw.decode("utf-16", "replace") if wide else raw.decode("utf-8-sig")
         except UnicodeDecodeError:
             text = raw.removeprefix(codecs.BOM_UTF8).decode("latin-1")
+        text = text.lstrip("\ufeff")  # a converted file may have several byte order marks
         if "\0" in text:
             raise InputError("is a binary file; it must be a text table (CSV) or .xlsx.")
     return Text(path, re.sub(r"\r*\n|\r", "\n", text) if "\r" in text else text, sha256)
@@ -183,10 +184,8 @@ def _above_numbers(grids: dict[str, list[list[str]]], names: set[str | int]) -> 
             return separator, above[-1]
         if any(isinstance(name, int) for name in names):
             return separator, -1
-        entries = ", ".join(
-            entry_line(c, str(k), CHANNELS[c].unit)
-            for k, c in enumerate(("time", "force", "displacement"), 1)
-        )
+        channels = enumerate(("time", "force", "displacement"), 1)
+        entries = ", ".join(str(Entry(c, k, CHANNELS[c].unit)) for k, c in channels)
         shown = ", ".join(grid[rows[0]])[:LONGEST]
         raise InputError(
             f"no row names the columns above row {rows[0] + 1}, {shown!r}; give their numbers in "
@@ -332,6 +331,12 @@ def _checked_numbers(table: Table, columns: dict[str, int]) -> tuple[Array, Inte
             wrong = f"row {row} has {len(cells)} cells, but the header has {count}"
             raise InputError(f"{wrong}; every row must have as many as the header.")
         if not any(cells[k] for k in measured):
+            filled = list(filter(None, cells))
+            if len(filled) == 1 and _is_sample(re.split(r"[\s;|,]+", filled[0])):
+                raise InputError(
+                    f"row {row} has its numbers in one cell, {filled[0][:LONGEST]!r}; all rows "
+                    "must have the separator of the header and closed quotation marks."
+                )
             empty.append(row)
             continue
         wrongs = ((table.headers[k].text, _wrong(cells[k], table.decimal)) for k in places)

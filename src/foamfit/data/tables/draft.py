@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from foamfit.data.measurement import MIN_ROWS, entry_line
-from foamfit.data.tables.columns import Source, entries_of, quoted, si_factor
+from foamfit.data.measurement import MIN_ROWS, Entry
+from foamfit.data.tables.columns import Source, column_of, entries_of, si_factor
 from foamfit.data.tables.csv_table import Table, Text, read_numbers
 from foamfit.data.tables.headers import channel_of
 from foamfit.data.toml_file import LONGEST, toml_beside
@@ -87,8 +87,8 @@ def _columns(text: Text) -> list[str]:
             why = str(error).removeprefix("column ").partition(";")[0]
         if channel in unclear:
             why = f"which of {listed(map(table.name, unclear[channel]))} is it?"
-        line = entry_line(channel, quoted(table, k), unit)
-        lines.append(f"# {line}  # needed: {why}" if why else line)
+        line = Entry(channel, column_of(table, k), unit)
+        lines.append(f"# {line}  # needed: {why}" if why else str(line))
     known = {*source.columns.values(), *(k for places in unclear.values() for k in places)}
     others = [k for k, h in enumerate(table.headers) if h.text and k not in known]
     present = source.columns.keys() | unclear.keys()
@@ -117,12 +117,12 @@ def _proposal(table: Table, names: tuple[str, ...], columns: list[int]) -> str:
             return entry
     volts = [k for k in nameless if factor(table.headers[k].unit or "", "V") is not None]
     if len(volts) == 1 and "force" in names:
-        return entry_line("force", quoted(table, volts[0]), scale='"100 N/V"')
+        return str(Entry("force", column_of(table, volts[0]), scale=100.0, scale_unit="N/V"))
     plain = [k for k in nameless if table.headers[k].unit is None]
     clocks = {k: _is_clock(table, k) for k in plain}
     fits = [k for k, clock in clocks.items() if clock == ("time" in names)]
-    column = quoted(table, fits[0]) if len(fits) == 1 else '"…"'
-    return entry_line(names[0], column, channel_of(names[0]).unit)
+    column = column_of(table, fits[0]) if len(fits) == 1 else "…"
+    return str(Entry(names[0], column, channel_of(names[0]).unit))
 
 
 def _is_clock(table: Table, column: int) -> bool | None:

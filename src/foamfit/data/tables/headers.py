@@ -126,6 +126,8 @@ def parse_header(text: str) -> Header:
             inner, aside = parse_header(name), {*_words(unit)}
             if inner.unit is not None or aside & _ASIDE:
                 return Header(text, words, inner.unit)
+        elif (other := parse_header(name).unit) and is_unit(other) and other != unit:
+            unit = f"{other} or {unit}"  # force (N) (kN): which one is right is unknown
         return Header(text, _words(name), unit)
     tokens = re.split(r"[\s_]+", text)
     for i in range(1, len(tokens)):

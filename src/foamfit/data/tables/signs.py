@@ -57,7 +57,7 @@ def negative_channels(channels: Mapping[str, Array], time: Array | None) -> tupl
         compared = other and channel not in (other, "velocity")
         if compared and _opposite(values, upright[other]):
             wrong.append(channel)
-    if time is not None and "velocity" in upright and _against(upright, force, motion, time[kept]):
+    if time is not None and "velocity" in upright and _against(upright, motion, time[kept]):
         wrong.append("velocity")
     return wrong, True
 
@@ -158,18 +158,13 @@ def _from_start(force: Array) -> Array:
     return force - np.median(force[: max(5, force.size // 200)])
 
 
-def _against(channels: Mapping[str, Array], force: str, motion: str, time: Array) -> bool:
+def _against(channels: Mapping[str, Array], motion: str, time: Array) -> bool:
     """Return whether a velocity is negative in compression.
 
-    It is the derivative of the motion; without a motion, it starts positive and the force reduces
-    it.
+    It is the derivative of the motion; without a motion, its integral rises first.
     """
     velocity = channels["velocity"]
     if motion:
         return bool(np.dot(np.gradient(channels[motion], time), velocity) < 0.0)
-    if not force:
-        steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time)
-        return _falls(np.append(0.0, np.cumsum(steps)))
-    level = _from_start(channels[force])
-    impulse = np.append(0.0, np.cumsum(0.5 * (level[1:] + level[:-1]) * np.diff(time)))
-    return bool(np.dot(impulse, velocity - velocity[0]) > 0.0 and velocity[0] < 0.0)
+    steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time)
+    return _falls(np.append(0.0, np.cumsum(steps)))
