@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import lmfit
 from lmfit import Minimizer
@@ -16,13 +14,11 @@ from foamfit.errors import InputError
 from foamfit.fitting.minimizer import minimizer_of, result_of
 from foamfit.one_model import SEARCHED, Options, Progress, identify, judge
 from foamfit.options import Keywords, documented
-from foamfit.report.figures import TWO, inches
-from foamfit.report.folder import save_whole, write_result
+from foamfit.report.folder import write_result
 from foamfit.report.plots import draw_panel
 from foamfit.report.readable import readable
-from foamfit.report.result_figures import Mapped
 from foamfit.report.samples import dataset
-from foamfit.report.shown import Shown, brief
+from foamfit.report.shown import Result, brief
 from foamfit.report.summary import compared
 from foamfit.report.tables import frame
 from foamfit.results import Fit
@@ -37,8 +33,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-class FitResult(Shown, Fit):
+class FitResult(Result, Fit):
     """Result of a fit: parameters, intervals, curves, status and warnings."""
+
+    write = write_result
 
     def plot(self, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
         """Plot one panel, measured and fitted, into `ax` or into a new figure.
@@ -79,24 +77,6 @@ class FitResult(Shown, Fit):
         line = f"{self.law}, {self.drive} drive · status {self.status} · misfit: {misfits or '–'}"
         rows = [readable(name, p) for name, p in self.parameters.items() if p.state != "fixed"]
         return brief(self.measurement.name, line, rows, html)
-
-    def save(
-        self,
-        folder: str | Path,
-        *,
-        report: bool = True,
-        figure_width: str = TWO,
-        mapped: Mapped = map,
-    ) -> Path:
-        """Write the result folder and return its path; an older folder is replaced at the end.
-
-        Without `report`, neither report.html nor figures are written. `figure_width` is "one" or
-        "two" columns, or a length ("85 mm"); ", untitled" after it omits the titles. `mapped` draws
-        the figures; give the `map` of an executor to draw them in parallel.
-        """
-        inches(figure_width)  # rejects an invalid width
-        drawn: Any = {"pages": report, "width": figure_width, "mapped": mapped}
-        return save_whole(folder, partial(write_result, self, **drawn))
 
 
 @documented

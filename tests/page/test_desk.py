@@ -24,7 +24,7 @@ from foamfit.page.desk import Desk, join_toml, safe_name, split_toml, wrong_quan
 from foamfit.page.turning import Turning
 from foamfit.page.worker import News, Worker
 from foamfit.report.folder import load_result
-from foamfit.report.studies import cycles as cycles_report
+from foamfit.study import cycles as cycles_report
 
 TEST = EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv"
 GOOD = {

@@ -22,7 +22,7 @@ from foamfit.terminal import say
 if TYPE_CHECKING:
     from foamfit.api import FitResult
     from foamfit.data.measurement import Measurement
-    from foamfit.report.studies.cycles import CycleFits
+    from foamfit.study.cycles import CycleFits
 
 # Options that are not keywords of `foamfit.fit`, and options that select its `intervals`.
 NO_KEYWORDS, WAYS = ("cycle", "cycles", "model"), ("profile", "mcmc")
@@ -213,9 +213,9 @@ def fit(
             check(place)  # again, for another fit may have written there in the meantime
             found.save(place, **how)
 
-        from foamfit.report.studies.cycles import cycles_text
         from foamfit.report.summary import summary_text
         from foamfit.results import Fit
+        from foamfit.study.cycles import cycles_text
 
         if isinstance(found, Fit):
             page, which, failed = "report.html", "", found.status == "failed"

@@ -178,9 +178,8 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
     read = read_study(study)
     output.folder(folder, [path for _, path, _ in read.tests])
     with options.compiling(output.silent, read.model, read.relaxation) as compile_rest:
-        from foamfit.report.studies.joint import joint_text
         from foamfit.study.joint import joint as fit_jointly
-        from foamfit.study.joint_result import FEW_FOLDERS
+        from foamfit.study.joint_result import FEW_FOLDERS, joint_text
         from foamfit.study.processes import begin
 
         compile_rest()

@@ -242,9 +242,9 @@ def _run(job: Job) -> tuple[str, str]:
     """Fit and write the result; return why the fit failed or "", and the text on cycles."""
     try:
         from foamfit.cli.fit import read_as_asked
-        from foamfit.report.studies.cycles import cycles_text
         from foamfit.results import Fit
         from foamfit.solve.precompile import at_first_use
+        from foamfit.study.cycles import cycles_text
         from foamfit.terminal import without_ctrl_c
 
         teller, asked = _Teller(), parsed(job.arguments)

@@ -23,8 +23,8 @@ from foamfit.options import Keywords
 from foamfit.parts import law_in_words
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import FILES, check_target, is_written
+from foamfit.report.listing import Row
 from foamfit.report.studies import batch as tables
-from foamfit.report.studies.batch import Row
 from foamfit.solve import cache, precompile
 from foamfit.springs.model import Model, with_options
 from foamfit.study.batch_work import Outcome, Recipe, Task, fingerprint, put, stored, work

@@ -28,7 +28,8 @@ from foamfit.report.folder import try_target
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
 from foamfit.study.joint_fit import Map, fit_jointly
-from foamfit.study.joint_result import FEW_FOLDERS, JointResult, result_of
+from foamfit.study.joint_parameters import result_of
+from foamfit.study.joint_result import FEW_FOLDERS, JointResult
 from foamfit.study.processes import begin, workers
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted

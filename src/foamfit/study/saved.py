@@ -20,9 +20,9 @@ from foamfit.report.folder import load_result
 from foamfit.report.samples import FILE as SAMPLES
 from foamfit.report.samples import read_samples
 from foamfit.report.studies.batch import read_table
-from foamfit.report.studies.cycles import CycleFits
 from foamfit.results import KEPT
 from foamfit.springs.model import Model
+from foamfit.study.cycles import CycleFits
 from foamfit.study.joint_result import JointResult
 from foamfit.trust.identifiability import Insight
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,15 +14,13 @@ import numpy as np
 from foamfit.codec import plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, write_file
-from foamfit.parts import ParameterEstimate
 from foamfit.report.figures import write_both
-from foamfit.report.listing import Listed, index_page, small_loop
+from foamfit.report.listing import Row, index_page
 from foamfit.report.render import words
 from foamfit.report.studies.parameters import panels_of, plot_parameters
 from foamfit.report.summary import CURVES
 from foamfit.report.tables import (
     by_test_tex,
-    count_determined,
     unit_of_all,
     varied,
     wide,
@@ -47,24 +44,6 @@ _STATUS = {
 }
 MOST_ON_PAGE = 5000
 _MOST_REFUSALS = 20  # named on the terminal
-
-
-@dataclass(frozen=True)
-class Row:
-    """Result of one test of a batch, or of one cycle of it; `test` is its folder."""
-
-    test: str
-    file: str
-    status: str
-    error: str | None = None
-    misfit: Mapping[str, float | None] = field(default_factory=dict)
-    runtime_s: float | None = None
-    parameters: Mapping[str, ParameterEstimate] = field(default_factory=dict)
-
-    @property
-    def has_fit(self) -> bool:
-        """Whether there is an acceptable fit."""
-        return self.status in ("ok", "warnings")
 
 
 def row_of(test: str, file: str, result: Fit) -> Row:
@@ -178,22 +157,6 @@ def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | N
     if len(rows) > MOST_ON_PAGE:  # tests without a fit are always shown
         first = {id(row) for row in rows[:MOST_ON_PAGE]}
         shown = [row for row in rows if id(row) in first or not row.has_fit][: 2 * MOST_ON_PAGE]
-    listed = [
-        Listed(
-            place := folder / row.test,
-            row.test,
-            row.status,
-            row.misfit,
-            row.error or "",
-            "",
-            "",
-            *count_determined(row.parameters),
-            parameters=row.parameters,
-            more={} if row.runtime_s is None else {"run time (s)": (f"{row.runtime_s:.1f}", "")},
-            curves=small_loop(place / "curves.csv"),
-        )
-        for row in shown
-    ]
     more: Any = {"picture": picture, "csv": "summary.csv", "left_out": len(shown) < len(rows)}
-    text = index_page(listed, folder, title, counts_in_words(rows), **more)
+    text = index_page(shown, folder, title, counts_in_words(rows), **more)
     write_file(folder / "summary.html", text)

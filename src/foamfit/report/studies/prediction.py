@@ -16,10 +16,12 @@ from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
 from foamfit.parts import ParameterEstimate, law_in_words
 from foamfit.report import figures
-from foamfit.report import folder as results
 from foamfit.report.figures import BLUE, FITTED, INSIDE, SEEN, TWO, VERMILION
+from foamfit.report.folder import write_columns, write_json
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import words
+from foamfit.report.result_figures import Mapped
+from foamfit.report.shown import Result, told
 from foamfit.springs.model import Model
 from foamfit.text import percent
 
@@ -90,8 +92,8 @@ class PredictedCurve:
         return float(np.mean(self.parts[part][self.kept])) if part in self.parts else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
+@dataclass(frozen=True, eq=False, repr=False)
+class Prediction(Result):
     """Prediction, from a result, of a test that was not fitted; in SI."""
 
     source: str  #: Name of the result
@@ -118,29 +120,20 @@ class Prediction:
     #: from the origins of the file.
     aligned: dict[str, float] = field(default_factory=dict)
 
-    def __repr__(self) -> str:
+    _replaces = "prediction.json"  # a result of another kind may be its source
+
+    def _shown(self, *, html: bool = False) -> str:
         """Return the sentences on the prediction."""
-        head = f"{self.measurement.name} predicted from {self.source}"
-        return "\n  ".join((head, *self.sentences))
+        return told(f"{self.measurement.name} predicted from {self.source}", self.sentences, html)
 
-    def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
-        """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf``; return the folder.
-
-        A complete new prediction replaces an older one. Without `report` there is no figure. Its
-        width is "one" or "two" columns or a length such as "85 mm".
-        """
-        figures.inches(figure_width)  # reject an invalid width
-
-        def write(fresh: Path) -> None:
-            results.write_json(fresh / "prediction.json", self.to_json_dict())
-            results.write_columns(fresh / "prediction.csv", self.columns)
-            if report:
-                figure = plot_prediction(self, width=figure_width)
-                figures.write_both(figure, fresh / "prediction")
-
-        # A result of another kind may be the source of this prediction.
-        results.check_target(folder, of="prediction.json")
-        return results.save_whole(folder, write)
+    def write(
+        self, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
+    ) -> None:
+        """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf`` into an existing folder."""
+        write_json(folder / "prediction.json", self.to_json_dict())
+        write_columns(folder / "prediction.csv", self.columns)
+        if pages:
+            figures.write_both(plot_prediction(self, width=width), folder / "prediction")
 
     @property
     def law(self) -> str:
