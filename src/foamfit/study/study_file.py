@@ -8,34 +8,52 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from foamfit.data.toml_file import COUNT, FLAG, RANGE, Rule, check_keys, load_toml
-from foamfit.errors import InputError
+from foamfit.data.toml_file import (
+    COUNT,
+    FLAG,
+    RANGE,
+    Check,
+    Rule,
+    anything,
+    checked,
+    load_toml,
+    table_of,
+)
+from foamfit.errors import InputError, naming
 from foamfit.fitting.links import KINDS
-from foamfit.options import DRIVES, FREED, OF_FIT
+from foamfit.options import FREED, OF_FIT
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.test_files import find_tests
 
 # Kind of a parameter for which the evidence decides between `KINDS`.
 AUTO = "auto"
-_EXAMPLES = {"tests": 'tests = ["runs/*.csv"]', "model": 'model = "microscale"'}
 
 
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and bool(value.strip())
+def _text(right: str) -> Rule:
+    return Rule(lambda v: isinstance(v, str) and bool(v.strip()), f"text, like {right}")
 
 
-_RULES = {
-    "name": Rule(_is_text, 'text, like name = "new heel"'),
-    "specimen": Rule(_is_text, 'text, like specimen = "foam.toml"'),
-    "seed": Rule(lambda v: type(v) is int and v >= 0, OF_FIT["seed"].right),
+def _of_fit(name: str) -> Rule:
+    """Check of an option of a fit."""
+    return Rule(OF_FIT[name].admits, OF_FIT[name].right)
+
+
+_PATTERNS = Rule(
+    lambda v: isinstance(v, str) or (isinstance(v, list) and all(isinstance(p, str) for p in v)),
+    'a list like tests = ["runs/*.csv"]',
+)
+_KEYS: dict[str, Check] = {
+    "name": _text('name = "new heel"'),
+    "tests": _PATTERNS,
+    "model": _text('model = "microscale"'),
+    "specimen": _text('specimen = "foam.toml"'),
     "cycle": COUNT,
-    "cycles": Rule(RANGE.valid, f"{RANGE.right}, without cycle"),
-    "starts": COUNT,
-    "drive": Rule(lambda v: v in DRIVES, OF_FIT["drive"].right),
+    "cycles": RANGE,
+    **{name: _of_fit(name) for name in ("drive", "seed", "starts")},
     **dict.fromkeys(FREED, FLAG),
+    **dict.fromkeys(("relaxation", "specimens", "parameters"), anything),
 }
-_KEYS = (*_RULES, "tests", "model", "relaxation", "specimens", "parameters")
 
 
 @dataclass(frozen=True)
@@ -54,9 +72,9 @@ class Study:
     drive: str | None
     kinds: Mapping[str, str]
     held: Mapping[str, float]
-    seed: int
-    cycle: int | None
-    starts: int | None
+    seed: int = 0
+    cycle: int | None = None
+    starts: int | None = None
     cycles: tuple[int, int] | None = None  # first and last of several cycles fitted as one history
 
 
@@ -64,69 +82,45 @@ def read_study(path: str | Path) -> Study:
     """Read and check a study file; InputError names the file and the wrong or missing key."""
     path = Path(path)
     content = load_toml(path, "a study is a TOML with tests, model and [parameters]")
-    check_keys(f"{path}:", content, _KEYS)
-    try:
-        return _read(path, content)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-
-
-def _read(path: Path, content: Mapping[str, Any]) -> Study:
-    for key in ("tests", "model"):
-        if key not in content:
-            raise InputError(f"{key} is missing; give it like {_EXAMPLES[key]}")
-    for key, rule in _RULES.items():
-        both = key == "cycles" and "cycle" in content
-        if key in content and (both or not rule.valid(content[key])):
-            raise InputError(f"{key} = {content[key]!r} must be {rule.right}")
-    model = Model.of_result(content)
-    tests = _tests(path, content)
-    kinds, held = _parameters(content.get("parameters", {}), model)
-    return Study(
-        path=path,
-        name=content.get("name") or path.stem,
-        tests=tests,
-        model=model.name,
-        relaxation=model.relaxation,
-        drive=content.get("drive"),
-        kinds=kinds,
-        held=held,
-        seed=content.get("seed", 0),
-        cycle=content.get("cycle"),
-        cycles=tuple(content["cycles"]) if "cycles" in content else None,
-        starts=content.get("starts"),
-    )
+    found = checked(content, _KEYS, f"{path}:", ["tests", "model"])
+    with naming(path):
+        if {"cycle", "cycles"} <= content.keys():
+            raise InputError("give either cycle or cycles, not both")
+        model = Model.of_result(content)
+        kinds, held = _parameters(table_of(content, "parameters"), model)
+        given = {name: found[name] for name in ("seed", "cycle", "starts") if name in found}
+        return Study(
+            path=path,
+            name=content.get("name") or path.stem,
+            tests=_tests(path, content),
+            model=model.name,
+            relaxation=model.relaxation,
+            drive=content.get("drive"),
+            kinds=kinds,
+            held=held,
+            cycles=tuple(content["cycles"]) if "cycles" in content else None,
+            **given,
+        )
 
 
 def _tests(path: Path, content: Mapping[str, Any]) -> tuple[tuple[str, Path, Path | None], ...]:
     """Return tests with their TOML: from [specimens], or else the key specimen."""
-    patterns = content["tests"]
-    patterns = [patterns] if isinstance(patterns, str) else patterns
-    if not isinstance(patterns, list) or not all(isinstance(p, str) for p in patterns):
-        raise InputError(f"tests must be a list like {_EXAMPLES['tests']}")
     try:
-        found = find_tests(patterns, path.parent)
+        found = find_tests(content["tests"], path.parent)
     except InputError as error:
         raise InputError(f"tests: {error}") from None
     if len(found) < 2:
         raise InputError(
             f"tests names {'one test' if found else 'none'}; a joint fit needs at least two"
         )
-    specimens, names = content.get("specimens", {}), [name for name, _ in found]
-    if not isinstance(specimens, dict):
-        raise InputError(f'specimens must be a table of tests, like {names[0]} = "a.toml"')
-    check_keys("[specimens]", specimens, names)
-    for name, value in specimens.items():
-        if not isinstance(value, str):
-            raise InputError(f"[specimens] {name} = {value!r} must be the name of a TOML")
-    pairs = ((test, specimens.get(test[0], content.get("specimen"))) for test in found)
+    toml, specimens = _text('"a.toml"'), table_of(content, "specimens")
+    own = checked(specimens, dict.fromkeys([name for name, _ in found], toml), "[specimens]")
+    pairs = ((test, own.get(test[0], content.get("specimen"))) for test in found)
     return tuple((*test, None if toml is None else path.parent / toml) for test, toml in pairs)
 
 
-def _parameters(table: Any, model: Model) -> tuple[dict[str, str], dict[str, float]]:
+def _parameters(table: Mapping[str, Any], model: Model) -> tuple[dict[str, str], dict[str, float]]:
     """Return kinds, and values of fixed parameters, from the table [parameters]."""
-    if not isinstance(table, dict):
-        raise InputError('parameters must be a table, like s1_k0 = "shared"')
     kinds, held = dict[str, str](), dict[str, float]()
     for name, value in table.items():
         where = f"[parameters] {name}"
