@@ -19,7 +19,7 @@ from foamfit.report.plots import draw_panel
 from foamfit.report.readable import readable
 from foamfit.report.samples import dataset
 from foamfit.report.shown import Result, brief
-from foamfit.report.summary import compared
+from foamfit.report.summary import compared, summary_text
 from foamfit.report.tables import frame
 from foamfit.results import Fit
 from foamfit.solve.precompile import at_first_use
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 class FitResult(Result, Fit):
     """Result of a fit: parameters, intervals, curves, status and warnings."""
 
-    write = write_result
+    write, to_json_dict = write_result, Fit.to_json_dict
 
     def plot(self, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
         """Plot one panel, measured and fitted, into `ax` or into a new figure.
@@ -57,6 +57,10 @@ class FitResult(Result, Fit):
         Parameters without a standard error are held.
         """
         return result_of(self)
+
+    def text(self, *, verbose: bool = False) -> str:
+        """Return one screen on the fit, or with `verbose` all of it."""
+        return summary_text(self, verbose=verbose)
 
     def table(self) -> pd.DataFrame:
         """Return one row per parameter, in SI units; the output of its `to_latex` compiles."""

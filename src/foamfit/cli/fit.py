@@ -7,17 +7,15 @@ import re
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foamfit.cli import options
-from foamfit.cli.group import NOT_ACCEPTABLE, main
+from foamfit.cli.group import main
 from foamfit.cli.options import Output
 from foamfit.cli.progress import Progress, progress_line
 from foamfit.errors import InputError
 from foamfit.options import FREED, OPTIONS
-from foamfit.terminal import say
 
 if TYPE_CHECKING:
     from foamfit.api import FitResult
@@ -209,28 +207,5 @@ def fit(
         with progress_line(output.silent, "fit", says=not output.quiet) as news:
             found = replace(ready.fit(news), options=made)
 
-        def save(place: Path, **how: Any) -> None:
-            check(place)  # again, for another fit may have written there in the meantime
-            found.save(place, **how)
-
-        from foamfit.report.summary import summary_text
-        from foamfit.results import Fit
-        from foamfit.study.cycles import cycles_text
-
-        if isinstance(found, Fit):
-            page, which, failed = "report.html", "", found.status == "failed"
-            content, text = found.to_json_dict, partial(summary_text, found, verbose=verbose)
-        else:
-            page, which = "cycles.png", " of any cycle"
-            failed = all(one.status == "failed" for one in found.results.values())
-            content, text = partial(_content_of, found), partial(cycles_text, found)
-        output.finish(save, folder / page, content, text, mapped=drawers.map)
-    if failed:
-        say(f"foamfit: no acceptable fit{which} was found; see {folder}", err=True)
-    return NOT_ACCEPTABLE if failed else 0
-
-
-def _content_of(found: CycleFits) -> dict[str, Any]:
-    """Return the fits of several cycles as content of a JSON file."""
-    each = {n: one.to_json_dict() for n, one in sorted(found.results.items())}
-    return found.to_json_dict() | {"cycles": each}
+        page = folder / ("report.html" if ready.several is None else "cycles.png")
+        return output.finish(found, page, check=check, verbose=verbose, mapped=drawers.map)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -179,17 +178,13 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
     output.folder(folder, [path for _, path, _ in read.tests])
     with options.compiling(output.silent, read.model, read.relaxation) as compile_rest:
         from foamfit.study.joint import joint as fit_jointly
-        from foamfit.study.joint_result import FEW_FOLDERS, joint_text
-        from foamfit.study.processes import begin
+        from foamfit.study.joint_result import FEW_FOLDERS
+        from foamfit.study.processes import begin, workers
 
         compile_rest()
         if not output.no_report:
             begin(jobs, len(read.tests), FEW_FOLDERS)
         with progress_line(output.silent, "joint fit") as line:
             found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress)
-        page, text = folder / "joint.html", partial(joint_text, found)
-        output.finish(found.save, page, found.to_json_dict, text, jobs=jobs)
-    if found.status != "failed":
-        return 0
-    say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
-    return NOT_ACCEPTABLE
+        with workers(jobs, len(found.tests), FEW_FOLDERS) as each:
+            return output.finish(found, folder / "joint.html", mapped=each)

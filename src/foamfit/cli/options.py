@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from foamfit.cli.group import NOT_ACCEPTABLE
 from foamfit.cli.progress import progress_line
 from foamfit.errors import InputError
 from foamfit.files import check_file
@@ -23,6 +24,8 @@ from foamfit.terminal import say, without_ctrl_c
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
+    from foamfit.report.result_figures import Mapped
+    from foamfit.report.shown import Result
     from foamfit.study.processes import Processes
 
 Command = Callable[..., Any]
@@ -156,26 +159,33 @@ class Output:
 
     def finish(
         self,
-        save: Callable[..., object],
+        found: Result,
         page: Path,
-        content: Callable[[], Any],
-        text: Callable[[], str],
-        **options: Any,
-    ) -> None:
-        """Save a result in the folder of `page`, and print it and its place.
+        *,
+        check: Callable[[Path], object] = lambda _: None,
+        verbose: bool = False,
+        mapped: Mapped = map,
+    ) -> int:
+        """Save a result in the folder of `page`, print it and its place; return the exit code.
 
-        If saving fails, the result is printed all the same.
+        If saving fails, the result is printed all the same. `check` may refuse a folder.
         """
         from foamfit.report.folder import save_somewhere
 
-        options |= {"report": not self.no_report, "figure_width": self.figure_width}
+        def save(place: Path, **how: Any) -> None:
+            check(place)  # another fit may have written there in the meantime
+            found.save(place, figure_width=self.figure_width, mapped=mapped, **how)
+
         try:
             with progress_line(self.silent, "result") as line, without_ctrl_c():
                 line.progress(1.0, "writing the report")
-                save_somewhere(save, page.parent, **options)
+                save_somewhere(save, page.parent, report=not self.no_report)
         finally:
-            self.show(content, text)
+            self.show(found.printed, functools.partial(found.text, verbose=verbose))
         self.tell_written(page)
+        if found.failed:
+            say(f"foamfit: no acceptable fit was found; see {page.parent}", err=True)
+        return NOT_ACCEPTABLE if found.failed else 0
 
     def show(self, content: Callable[[], Any], text: Callable[[], str]) -> None:
         """Print a result as JSON or as text, whichever is asked for."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +132,6 @@ def predict(
     from foamfit.data.csv_file import read_test
     from foamfit.data.toml_file import toml_beside
     from foamfit.report.folder import check_target
-    from foamfit.report.studies.prediction import prediction_text
     from foamfit.study.identified import read_source
 
     toml = toml_beside(test)
@@ -147,8 +145,7 @@ def predict(
 
         compile_rest()
         found = study.predict(result, measurement, **asked)
-        page, text = folder / "prediction.png", partial(prediction_text, found)
-        output.finish(found.save, page, found.to_json_dict, text)
+        output.finish(found, folder / "prediction.png")
 
 
 @main.command()
@@ -186,15 +183,13 @@ def plan(
     given = [path for path in map(Path, results) if path.exists()]
     folder = output.folder(Path("plans", default), [*given, *([rig] if rig else [])])
     with options.compiling(output.silent) as compile_rest:
-        from foamfit.report.studies.plan import plan_text
         from foamfit.study import plan as study
 
         compile_rest()
         with progress_line(output.silent, "plan") as line:
             found = study.plan(*results, rig=rig, quantity=quantity, seed=seed,
                                progress=line.progress)  # fmt: skip
-        page, text = folder / "plan.html", partial(plan_text, found)
-        output.finish(found.save, page, found.to_json_dict, text)
+        output.finish(found, folder / "plan.html")
 
 
 @main.command()

@@ -242,9 +242,7 @@ def _run(job: Job) -> tuple[str, str]:
     """Fit and write the result; return why the fit failed or "", and the text on cycles."""
     try:
         from foamfit.cli.fit import read_as_asked
-        from foamfit.results import Fit
         from foamfit.solve.precompile import at_first_use
-        from foamfit.study.cycles import cycles_text
         from foamfit.terminal import without_ctrl_c
 
         teller, asked = _Teller(), parsed(job.arguments)
@@ -258,7 +256,7 @@ def _run(job: Job) -> tuple[str, str]:
         with without_ctrl_c():
             teller.progress(1.0, "writing the report", now=True)
             found.save(job.folder, figure_width=width)
-            told = "" if isinstance(found, Fit) else cycles_text(found)
+            told = "" if ready.several is None else found.text()
     except (InputError, SimulationError) as error:
         return str(error), ""
     except KeyboardInterrupt:

@@ -45,6 +45,23 @@ class Result:
         """Write all files into an existing folder; pages and figures only with `pages`."""
         raise NotImplementedError
 
+    @property
+    def failed(self) -> bool:
+        """Whether no acceptable fit was found."""
+        return getattr(self, "status", "") == "failed"
+
+    def text(self, *, verbose: bool = False) -> str:
+        """Return the text that the command prints; only that of a fit may be `verbose`."""
+        raise NotImplementedError
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the content of the JSON file of the result: SI, plain types, None if missing."""
+        raise NotImplementedError
+
+    def printed(self) -> dict[str, Any]:
+        """Return what the command prints as JSON."""
+        return self.to_json_dict()
+
     def __repr__(self) -> str:
         """Return the result in a few lines."""
         return self._shown()

@@ -105,6 +105,22 @@ class CycleFits(Result):
         }
         return dict(plain(content))
 
+    def printed(self) -> dict[str, Any]:
+        """Return what the command prints as JSON: also the fits."""
+        each = {n: one.to_json_dict() for n, one in sorted(self.results.items())}
+        return self.to_json_dict() | {"cycles": each}
+
+    @property
+    def failed(self) -> bool:
+        """Whether no acceptable fit was found of any cycle."""
+        return all(one.status == "failed" for one in self.results.values())
+
+    def text(self, *, verbose: bool = False) -> str:
+        """Return the text that the command prints."""
+        names = list(self.varied) if len(self.varied) <= MOST_NAMES else []
+        shown = {name: own_name(name, self.model) for name in names}
+        return words("cycles", found=self, names=shown)
+
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the loops of all cycles, measured and fitted, into axes or a new figure."""
         every = ((n, one.loop) for n, one in sorted(self.results.items()))
@@ -207,12 +223,6 @@ def fit_cycles(
             break
     made = first.data_sha256, chosen.stored(first, model, wanted)
     return CycleFits(first.name, model, first.cycles, results, refused, *made)
-
-
-def cycles_text(found: CycleFits) -> str:
-    """Return the text that the command prints for the cycles of a record."""
-    names = list(found.varied) if len(found.varied) <= MOST_NAMES else []
-    return words("cycles", found=found, names={name: own_name(name, found.model) for name in names})
 
 
 def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:

@@ -127,7 +127,8 @@ def joint(
         result = result_of(study, files, rates, rate0, fit, alone, slopes, **about)
     tell(1.0, "done")
     if out is not None:
-        result.save(out, jobs=jobs, report=report)
+        with workers(jobs, len(result.tests), FEW_FOLDERS) as each:
+            result.save(out, report=report, mapped=each)
     return result
 
 

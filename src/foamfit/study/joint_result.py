@@ -18,7 +18,7 @@ from foamfit.fitting.links import RATES
 from foamfit.parts import ParameterEstimate, law_in_words
 from foamfit.report import figures
 from foamfit.report.figures import TWO
-from foamfit.report.folder import check_target, write_json, write_result, write_text
+from foamfit.report.folder import write_json, write_result, write_text
 from foamfit.report.listing import Row, table_of
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import in_unit, readable, readable_unit
@@ -31,7 +31,6 @@ from foamfit.results import SCHEMA, Fit, Loop
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.joint_fit import Alternative, JointFit
-from foamfit.study.processes import workers
 from foamfit.text import counted, number, percent
 from foamfit.trust.covariance import RULE
 
@@ -144,29 +143,16 @@ class JointResult(Result):
         rows = [readable(name, p) for name, p in self.varied.items()]
         return brief(self.name, line, rows, html)
 
-    def save(  # type: ignore[override]
-        self,
-        folder: str | Path,
-        *,
-        jobs: int | None = None,
-        report: bool = True,
-        figure_width: str = TWO,
-    ) -> Path:
-        """Write joint.json, its page, its figure, table.tex, and a result folder per test.
-
-        An older result in the folder is replaced at the end, all at once. The folders of the tests
-        are written by `jobs` processes (by default one per core). Without `report`, only tables are
-        written. The width of figures is "one" or "two" columns or a length ("85 mm"). Returns the
-        folder.
-        """
-        check_target(folder)
-        with workers(jobs, len(self.tests), FEW_FOLDERS) as each:
-            return super().save(folder, report=report, figure_width=figure_width, mapped=each)
+    def text(self, *, verbose: bool = False) -> str:
+        """Return the text that the command prints."""
+        every = {n: p for n, p in self.parameters.items() if p.kind != "fixed" or p.value}
+        more: Any = {"parameters": every, "nuisance": NUISANCE, "between": between}
+        return words("joint", most=MOST_ROWS, **more, **_common(self))
 
     def write(
         self, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
     ) -> None:
-        """Write all files into an existing folder; figures and pages only with `pages`."""
+        """Write joint.json, its page, its figure, table.tex, and a result folder per test."""
         write_json(folder / "joint.json", self.to_json_dict())
         shown = self.of_springs
         kinds = {name: one.kind for name, one in shown.items()}
@@ -215,13 +201,6 @@ def _common(found: JointResult) -> dict[str, Any]:
         "curves": {name: label for name, label in MISFITS.items() if name in known},
         "ranged": any(one.range for one in found.parameters.values()),
     }
-
-
-def joint_text(found: JointResult) -> str:
-    """Return the text that the command prints for a joint fit."""
-    every = {n: p for n, p in found.parameters.items() if p.kind != "fixed" or p.value}
-    more: Any = {"parameters": every, "nuisance": NUISANCE, "between": between, "most": MOST_ROWS}
-    return words("joint", **more, **_common(found))
 
 
 def joint_page(found: JointResult, folder: Path, figure: bytes) -> str:

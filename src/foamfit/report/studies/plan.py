@@ -221,6 +221,10 @@ class Plan(Result):
         })  # fmt: skip
         return content
 
+    def text(self, *, verbose: bool = False) -> str:
+        """Return the text that the command prints."""
+        return words("plan_terminal", plan=self)
+
     def write(
         self, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
     ) -> None:
@@ -247,11 +251,6 @@ def _asked(one: Candidate) -> dict[str, Any]:
     given = {key: getattr(one, key) for key in SETTINGS}
     given = {key: value for key, value in given.items() if value not in (None, False, 0.0)}
     return given if one.drive == "displacement" else given | {"cycles": 1}
-
-
-def plan_text(plan: Plan) -> str:
-    """Return the text that the command prints."""
-    return words("plan_terminal", plan=plan)
 
 
 def plot_plan(plan: Plan, *, width: str = TWO) -> Figure:

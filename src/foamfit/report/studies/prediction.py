@@ -126,6 +126,12 @@ class Prediction(Result):
         """Return the sentences on the prediction."""
         return told(f"{self.measurement.name} predicted from {self.source}", self.sentences, html)
 
+    def text(self, *, verbose: bool = False) -> str:
+        """Return the text that the command prints, with half widths relative to the range."""
+        every = self.curves.values()
+        parts = [part for part in COLOURS if any(part in one.parts for one in every)]
+        return words("prediction", found=self, parts=parts)
+
     def write(
         self, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
     ) -> None:
@@ -218,12 +224,6 @@ class Prediction(Result):
         if (moved := self.curves.get("displacement_time")) is not None:
             columns["predicted strain"] = moved.predicted / height
         return columns
-
-
-def prediction_text(found: Prediction) -> str:
-    """Return the text that the command prints, with half widths relative to the range."""
-    present = [part for part in COLOURS if any(part in one.parts for one in found.curves.values())]
-    return words("prediction", found=found, parts=present)
 
 
 def plot_prediction(found: Prediction, *, width: str = TWO) -> Figure:
