@@ -16,9 +16,8 @@ import fabricated
 import foamfit as ff
 from conftest import synthetic_impact
 from foamfit.data.measurement import Outliers
-from foamfit.report.listing import Row
-from foamfit.report.studies import batch as tables
-from foamfit.report.studies.batch import row_of
+from foamfit.report import listing as tables
+from foamfit.report.listing import Row, row_of
 from foamfit.results import Profile
 from foamfit.study.identified import read_source
 from foamfit.trust.intervals import Intervals

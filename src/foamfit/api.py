@@ -14,10 +14,9 @@ from foamfit.errors import InputError
 from foamfit.fitting.minimizer import minimizer_of, result_of
 from foamfit.one_model import SEARCHED, Options, Progress, identify, judge
 from foamfit.options import Keywords, documented
-from foamfit.report.folder import write_result
+from foamfit.report.folder import dataset, write_result
 from foamfit.report.plots import draw_panel
 from foamfit.report.readable import readable
-from foamfit.report.samples import dataset
 from foamfit.report.shown import Result, brief
 from foamfit.report.summary import compared, summary_text
 from foamfit.report.tables import frame

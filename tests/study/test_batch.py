@@ -23,8 +23,7 @@ import fabricated
 import foamfit as ff
 from conftest import HEIGHT, run, run_refused, synthetic_impact, write_csv
 from foamfit.cli import many as command
-from foamfit.report.listing import Row
-from foamfit.report.studies.batch import row_of, write_comparison, write_page
+from foamfit.report.listing import Row, row_of, write_comparison, write_page
 from foamfit.study import batch as module
 from foamfit.study import batch_work
 from foamfit.study.batch_work import work

@@ -73,7 +73,7 @@ def batch(
 
     if scheduler is None:
         processes.prepare((*processes.FITS, *(() if output.no_report else processes.PAGES)))
-    from foamfit.report.studies.batch import summary_words, table_rows
+    from foamfit.report.listing import summary_words, table_rows
     from foamfit.study.batch import run
     from foamfit.study.batch_work import Recipe
 

@@ -13,8 +13,16 @@ import numpy as np
 from foamfit.errors import InputError
 from foamfit.report import figures
 from foamfit.report.figures import GREY, TWO, VERMILION
-from foamfit.report.marks import annotate
-from foamfit.report.panels import Line, Panel, draw, draw_residuals, is_known, panels_of, size
+from foamfit.report.panels import (
+    Line,
+    Panel,
+    annotate,
+    draw,
+    draw_residuals,
+    is_known,
+    panels_of,
+    size,
+)
 from foamfit.report.readable import readable_unit
 from foamfit.terminal import printable
 

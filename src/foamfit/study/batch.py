@@ -21,10 +21,10 @@ from foamfit.fitting.problem import check_fixed_and_varied
 from foamfit.one_model import Options
 from foamfit.options import Keywords
 from foamfit.parts import law_in_words
+from foamfit.report import listing as tables
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import FILES, check_target, is_written
 from foamfit.report.listing import Row
-from foamfit.report.studies import batch as tables
 from foamfit.solve import cache, precompile
 from foamfit.springs.model import Model, with_options
 from foamfit.study.batch_work import Outcome, Recipe, Task, fingerprint, put, stored, work

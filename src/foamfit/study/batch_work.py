@@ -25,8 +25,7 @@ from foamfit.data.toml_file import motion_file
 from foamfit.errors import InputError, SimulationError
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
-from foamfit.report.listing import Row
-from foamfit.report.studies.batch import REFUSED, row_of
+from foamfit.report.listing import REFUSED, Row, row_of
 from foamfit.springs import laws
 from foamfit.study.cycles import fit_cycles
 
