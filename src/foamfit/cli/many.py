@@ -74,41 +74,36 @@ def batch(
     if scheduler is None:
         processes.prepare((*processes.FITS, *(() if output.no_report else processes.PAGES)))
     from foamfit.report.listing import summary_words, table_rows
-    from foamfit.study.batch import run
-    from foamfit.study.batch_work import Recipe
+    from foamfit.study import batch as study
 
-    recipe = Recipe(
-        model=asked["model"],
-        options=search,
-        cycles=cycles,
-        pages=not output.no_report,
-        width=output.figure_width,
-        history=asked["cycles"],
-    )
     if scheduler is None:
-        with options.compiling(output.silent, recipe.model, search["relaxation"]) as compile_rest:
+        with options.compiling(output.silent, asked["model"], search["relaxation"]) as compile_rest:
             compile_rest()
     with (
         nullcontext() if scheduler is None else _cluster(scheduler) as executor,
         progress_line(output.silent, "batch") as line,
     ):
+        found: list[Batch] = []
 
         def tell(made: Batch) -> None:
+            found[:] = [made]
             done, left = len(made.rows), len(made.tests) - len(made.rows)
             state = f"{done} done, {made.wrong} without a fit, {left} left"
             line.progress(made.fitted / max(made.fitted + left, 1), state)
 
-        where: Any = {"out": output.out, "executor": executor, "jobs": jobs, "progress": tell}
-        found = run(tests, recipe, fresh=fresh, specimen=specimen, **where)
-    rows = found.summary
+        how: Any = {"report": not output.no_report, "figure_width": output.figure_width}
+        how |= {"cycle": "all" if cycles == () else cycles, "cycles": asked["cycles"]}
+        how |= {"executor": executor, "jobs": jobs, "fresh": fresh, "specimen": specimen}
+        study.batch(tests, out=output.out, model=asked["model"], progress=tell, **how, **search)
+    rows, folder = found[0].summary, found[0].out
 
     output.show(lambda: table_rows(rows), lambda: summary_words(rows))
-    output.tell_written(found.out / "summary.html")
+    output.tell_written(folder / "summary.html")
     wrong = sum(not row.has_fit for row in rows)
     if not wrong:
         return 0
     have = "has" if wrong == 1 else "have"
-    summary = found.out / "summary.csv"
+    summary = folder / "summary.csv"
     say(f"foamfit: {wrong} of {len(rows)} tests {have} no acceptable fit; see {summary}", err=True)
     return NOT_ACCEPTABLE
 

@@ -33,8 +33,8 @@ SAMPLES = "samples.nc"
 # Files of each kind of result, by the file that identifies it. They include files that only older
 # versions wrote, so that older folders can be replaced.
 _OLDER = {"fit.csv", "residuals.csv", "sensitivities.csv", "residuals.pdf", "information.pdf"}
-_OLDER |= {"snapping.pdf", "profiles.pdf"}
-_TABLES = {"fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "budget.csv"}
+_OLDER |= {"snapping.pdf", "profiles.pdf", "ladder.csv"}
+_TABLES = {"fit.json", "parameters.csv", "curves.csv", "profiles.csv", "budget.csv"}
 _DRAWN = {"fit.png", "fit.pdf", "report.html"}
 _KINDS = ("json", "csv", "html", "tex", "png", "pdf")
 FILES = {
@@ -243,8 +243,8 @@ def write_result(
 ) -> None:
     """Write all files of a result into an existing folder; report and figures only with `pages`.
 
-    ``profiles.csv`` and ``ladder.csv`` are written if there are profiles and a ladder,
-    ``budget.csv`` if the budget contains more than the parameters. For `width` and `mapped` see
+    ``profiles.csv`` is written if there are profiles, ``budget.csv`` if the budget contains more
+    than the parameters. For `width` and `mapped` see
     `foamfit.report.result_figures.draw_all`.
     """
     figures = draw_all(result, width, mapped) if pages else ()  # other processes start to draw now
@@ -264,8 +264,6 @@ def write_result(
         write_samples(folder / SAMPLES, result.draws)
     if pages and result.budget is not None and result.budget.telling:
         write_table(folder / "budget.csv", result.budget.rows())
-    if result.ladder is not None:
-        write_table(folder / "ladder.csv", result.ladder.rows())
     for name, images in (drawn := dict(figures)).items():
         for kind in ("png", "pdf"):
             if content := getattr(images, kind, b""):

@@ -227,7 +227,7 @@ def batch(
         width is fitted again, because its curves are not stored.
     progress : callable, optional
         Called with the `Batch` after each test; its `rows`, `tests`, `wrong` and `fitted` describe
-        the progress.
+        the progress, and at the end its `summary` the results.
 
     Returns
     -------
@@ -242,55 +242,31 @@ def batch(
     numbers = () if cycle == "all" else cycle
     if numbers is not None and not isinstance(numbers, int):
         numbers = tuple(int(number) for number in numbers)
-    done = run(
-        tests,
-        Recipe(model, options, numbers, report, figure_width, history=cycles),
-        out=out,
-        executor=executor,
-        jobs=jobs,
-        fresh=fresh,
-        specimen=specimen,
-        progress=progress,
-    )
-    return tables.table(done.summary)
-
-
-def run(
-    tests: Tests,
-    recipe: Recipe,
-    *,
-    out: str | Path | None = None,
-    executor: Executor | None = None,
-    jobs: int | None = None,
-    fresh: bool = False,
-    specimen: str | Path | None = None,
-    progress: Callable[[Batch], None] | None = None,
-) -> Batch:
-    """Fit the tests as `batch` does, and return the finished `Batch`."""
-    options = Options.of("batch", recipe.options)
-    recipe = replace(recipe, model=_checked(recipe.model, options), options=vars(options))
+    chosen = Options.of("batch", options)
+    named = _checked(model, chosen)
+    recipe = Recipe(named, vars(chosen), numbers, report, figure_width, history=cycles)
     if jobs is not None:
         check_whole("jobs", jobs, 1)
-    if recipe.cycles is not None and recipe.history is not None:
+    if numbers is not None and cycles is not None:
         raise InputError("give either cycle or cycles, not both")
     if jobs is not None and executor is not None:
         raise InputError("jobs and an executor exclude each other; leave one of them out")
-    inches(recipe.width)  # rejects an invalid width
+    inches(figure_width)  # rejects an invalid width
     toml = None if specimen is None else Path(specimen)
     if toml is not None and not toml.is_file():
         raise InputError(f"{toml}: no such file; give the TOML of the specimen for all tests")
-    folder = Path("fits", "batch", recipe.model) if out is None else Path(out)
-    named, notify = find_tests(tests), progress or (lambda _: None)
-    made = Batch(folder, recipe, named, toml, executor is not None, fresh, notify)
+    folder = Path("fits", "batch", named) if out is None else Path(out)
+    found, notify = find_tests(tests), progress or (lambda _: None)
+    made = Batch(folder, recipe, found, toml, executor is not None, fresh, notify)
     _check_out(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        sweep(folder.resolve(), [*(name for name, _ in named), *FILES["batch.json"]])
+        sweep(folder.resolve(), [*(name for name, _ in found), *FILES["batch.json"]])
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {reason(error)}") from None
     with _executor(executor, jobs, made) as runner:
         made.fit(runner)
-    return made
+    return tables.table(made.summary)
 
 
 def _checked(model: str, options: Options) -> str:
