@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,7 @@ from foamfit.report.readable import readable_unit
 from foamfit.report.render import words
 from foamfit.report.result_figures import Mapped
 from foamfit.report.shown import Result, told
+from foamfit.results import flags_of
 from foamfit.springs.model import Model
 from foamfit.text import percent
 
@@ -164,36 +165,24 @@ class Prediction(Result):
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``prediction.json``: SI, plain types, None for missing values."""
         m, model = self.measurement, Model.parse(self.model)
-        first = ["relaxation", "drive", "seed", "draws", "redrawn", "rate", "fitted_rates"]
-        first += ["extrapolated", "misfit", "inside", "by_cycle"]
-        last = ("parameters", "held", "aligned", "warnings", "sentences")
-        content: dict[str, Any] = plain(
-            {
-                "schema": SCHEMA,
-                "foamfit": version("foamfit"),
-                "test": m.name,
-                "data_sha256": m.data_sha256,
-                "cycle": m.cycle,
-                "last_cycle": m.last_cycle,
-                "result": self.source,
-                "joint": self.joint,
-                "model": model.words,
-                **model.options,
-                **{name: getattr(self, name) for name in first},
-                "curves": {
-                    name: {
-                        "range": curve.range,
-                        "half_width": curve.half_width,
-                        "half_widths": {part: curve.half_width_of(part) for part in curve.parts},
-                        "n": int(curve.kept.sum()),
-                        "unit": curve.unit,
-                    }
-                    for name, curve in self.curves.items()
-                },
-                **{name: getattr(self, name) for name in last},
+        renamed = ("source", "measurement", "model", "curves")
+        names = [one.name for one in fields(self) if one.name not in renamed]
+        names += ["inside", "by_cycle"]
+        curves = {
+            name: {
+                "range": curve.range,
+                "half_width": curve.half_width,
+                "half_widths": {part: curve.half_width_of(part) for part in curve.parts},
+                "n": int(curve.kept.sum()),
+                "unit": curve.unit,
             }
-        )
-        return content
+            for name, curve in self.curves.items()
+        }
+        content = {"schema": SCHEMA, "foamfit": version("foamfit"), "test": m.name}
+        content |= {name: getattr(m, name) for name in ("data_sha256", "cycle", "last_cycle")}
+        content |= {"result": self.source, "model": model.words, **model.options}
+        content |= {name: getattr(self, name) for name in names} | {"curves": curves}
+        return dict(plain(content))
 
     @property
     def columns(self) -> dict[str, Array]:
@@ -213,11 +202,7 @@ class Prediction(Result):
             columns[f"{channel} band high ({unit})"] = curve.hi
             for part, width in curve.parts.items():
                 columns[f"{channel} half width, {part.replace('_', ' ')} ({unit})"] = width
-            outliers, sampled = m.outliers.get(channel), m.sampled.get(channel)
-            if outliers is not None and outliers.left_out.any():
-                columns[f"outliers of {channel} left out"] = outliers.left_out.astype(int)
-            if sampled is not None:
-                columns[f"{channel} is measured"] = sampled.astype(int)
+        columns |= flags_of(m)
         height = m.specimen.height
         if m.displacement is not None:
             columns["measured strain"] = m.displacement / height
