@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -29,7 +29,7 @@ MARKS = ("^", "v", "D", "p")
 
 @dataclass(frozen=True)
 class Line:
-    """A curve of a panel in SI; `residual` of a measured one is in % of its range."""
+    """A curve of a panel in SI, or with `high` a band between two curves."""
 
     x: Array
     y: Array
@@ -37,12 +37,15 @@ class Line:
     style: dict[str, Any]
     kind: Literal["measured", "fitted", "other"] = "other"
     node: int = 0  # interior mass, 0 = top
-    residual: Array | None = None
+    high: Array | None = None
 
 
 @dataclass(frozen=True)
 class Panel:
-    """Curves in common axes, with the names and SI units of the axes."""
+    """Curves in common axes, with the names and SI units of the axes.
+
+    `below` are curves in a strip below the panel, in % of the measured range: residuals or others.
+    """
 
     name: str  # "stress-strain", …
     x_name: str
@@ -50,6 +53,8 @@ class Panel:
     y_name: str
     y_unit: str
     lines: list[Line]
+    below: list[Line] = field(default_factory=list)
+    below_name: str = "residual"
 
     @property
     def is_loop(self) -> bool:
@@ -87,32 +92,37 @@ def panels_of(result: Fit) -> list[Panel]:
     def compared(curve: str, fitted: Array | None) -> Array | None:
         return None if result.misfit.get(curve) is None else fitted
 
-    fitted = compared("stress_time", c.stress)
-    pushing = _measured(c.time, c.measured_stress, fitted) + _fitted(c.time, c.stress)
-    fitted = compared("displacement_time", c.displacement)
-    moving = _measured(c.time, c.measured_displacement, fitted, motion)
+    pushing = measured(c.time, c.measured_stress) + _fitted(c.time, c.stress)
+    moving = measured(c.time, c.measured_displacement, motion)
     moving += _fitted(c.time, c.displacement)
-    for node, (measured, fitted) in c.interior.items():
-        moving += _measured(c.time, measured, fitted, node=node) + _fitted(c.time, fitted, node)
-    loop = _measured(strain, c.measured_stress, compared("stress_strain", c.stress_along), motion)
+    fitted = compared("displacement_time", c.displacement)
+    off = _residual(c.time, c.measured_displacement, fitted)
+    for node, (seen, fitted) in c.interior.items():
+        moving += measured(c.time, seen, node=node) + _fitted(c.time, fitted, node)
+        off += _residual(c.time, seen, fitted, node)
+    loop = measured(strain, c.measured_stress, motion)
+    along = compared("stress_strain", c.stress_along)
     loop += _fitted(None if moved is None else moved / height, pushed)
     if strain is not None and c.stress_along is not None and not is_known(result):
         # Wide and pale below the others, because it coincides with them if the fit is good.
         pale = {"color": PALE, "lw": 3.2, "zorder": 2}
         loop.append(Line(strain, c.stress_along, "springs along measured strain", pale))
+    pushed_off = _residual(c.time, c.measured_stress, compared("stress_time", c.stress))
+    looped_off = _residual(strain, c.measured_stress, along)
     panels = [
-        Panel("stress-time", "time", "s", "stress", "Pa", pushing),
-        Panel("displacement-time", "time", "s", "displacement", "m", moving),
-        Panel("stress-strain", "strain", "–", "stress", "Pa", loop),
+        Panel("stress-time", "time", "s", "stress", "Pa", pushing, pushed_off),
+        Panel("displacement-time", "time", "s", "displacement", "m", moving, off),
+        Panel("stress-strain", "strain", "–", "stress", "Pa", loop, looped_off),
     ]
     if is_known(result):
         panels = [panels[2], panels[0]]
     return [panel for panel in panels if panel.lines]
 
 
-def _measured(
-    x: Array | None, y: Array | None, fitted: Array | None, motion: str = "measured", node: int = 0
+def measured(
+    x: Array | None, y: Array | None, motion: str = "measured", node: int = 0
 ) -> list[Line]:
+    """Return a measured curve, or none if it is missing."""
     if x is None or y is None:
         return []
     label, mark, edge = "measured", "o", "0.6"
@@ -122,8 +132,15 @@ def _measured(
     elif motion != "measured":
         label, mark = f"measured, motion {motion}", "s"
     style = {"marker": mark, "mfc": "white", "mec": edge, "mew": 0.6, "ms": 3.4, "zorder": 3}
-    residual = None if fitted is None else 100.0 * (fitted - y) / (float(np.ptp(y)) or 1.0)
-    return [Line(x, y, label, style, "measured", node, residual)]
+    return [Line(x, y, label, style, "measured", node)]
+
+
+def _residual(x: Array | None, y: Array | None, fitted: Array | None, node: int = 0) -> list[Line]:
+    if x is None or y is None or fitted is None:
+        return []
+    style = {"color": _colour(node), "lw": 0.7}
+    off = 100.0 * (fitted - y) / (float(np.ptp(y)) or 1.0)
+    return [Line(x, off, "_fitted − measured", style)]
 
 
 def _fitted(x: Array | None, y: Array | None, node: int = 0) -> list[Line]:
@@ -143,6 +160,9 @@ def draw(ax: Axes, panel: Panel) -> None:
     fx, x_label, fy, y_label = panel.scale()
     for line in panel.lines:
         x, y, style = line.x / fx, line.y / fy, line.style
+        if line.high is not None:
+            ax.fill_between(x, y, line.high / fy, label=line.label, **style)
+            continue
         if line.kind == "measured":
             thin: Any = {"color": "0.82", "lw": 0.5, "zorder": 1, "rasterized": x.size > MANY}
             ax.plot(x, y, label=f"_{line.label.removeprefix('_')}, all samples", **thin)
@@ -153,16 +173,14 @@ def draw(ax: Axes, panel: Panel) -> None:
     ax.margins(0.05, 0.11)
 
 
-def draw_residuals(ax: Axes, strip: Axes, panel: Panel) -> None:
-    """Draw fitted minus measured below a panel, in percent of the measured range."""
-    for line in panel.lines:
-        if line.residual is not None:
-            style: Any = {"color": _colour(line.node), "lw": 0.7, "label": "_fitted − measured"}
-            style["rasterized"] = line.x.size > MANY
-            strip.plot(line.x / panel.scale()[0], line.residual, **style)
+def draw_below(ax: Axes, strip: Axes, panel: Panel) -> None:
+    """Draw the strip below a panel, such as fitted minus measured."""
+    for line in panel.below:
+        style = line.style | {"rasterized": line.x.size > MANY}
+        strip.plot(line.x / panel.scale()[0], line.y, label=line.label, **style)
     strip.axhline(0.0, color=GREY, lw=0.6, zorder=1)
-    strip.set(xlabel=ax.get_xlabel(), label=f"{panel.name}, residual")
-    strip.set_ylabel("residual\n(% of range)", fontsize=7)
+    strip.set(xlabel=ax.get_xlabel(), label=f"{panel.name}, {panel.below_name}")
+    strip.set_ylabel(f"{panel.below_name}\n(% of range)", fontsize=7)
     strip.sharex(ax)
     ax.set_xlabel("")
     ax.tick_params(labelbottom=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
 from importlib.metadata import version
@@ -21,7 +21,7 @@ from foamfit.report.figures import TWO
 from foamfit.report.folder import write_json, write_result, write_text
 from foamfit.report.listing import Row, table_of
 from foamfit.report.plots import draw_loops
-from foamfit.report.readable import in_unit, readable, readable_unit
+from foamfit.report.readable import readable, readable_unit
 from foamfit.report.render import page, words
 from foamfit.report.result_figures import Mapped
 from foamfit.report.shown import Result, brief
@@ -31,7 +31,7 @@ from foamfit.results import SCHEMA, Fit, Loop
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.joint_fit import Alternative, JointFit
-from foamfit.text import counted, number, percent
+from foamfit.text import counted, number
 from foamfit.trust.covariance import RULE
 
 if TYPE_CHECKING:
@@ -117,6 +117,11 @@ class JointResult(Result):
         every = self.parameters.items()
         return {n: p for n, p in every if n not in NUISANCE and (p.kind != "fixed" or p.value)}
 
+    @property
+    def law(self) -> str:
+        """The model and its relaxation in words."""
+        return law_in_words(self.model, self.relaxation)
+
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the loops of all tests, measured and fitted, into axes or a new figure."""
         return draw_loops(self.loops, ax)
@@ -146,8 +151,10 @@ class JointResult(Result):
     def text(self, *, verbose: bool = False) -> str:
         """Return the text that the command prints."""
         every = {n: p for n, p in self.parameters.items() if p.kind != "fixed" or p.value}
-        more: Any = {"parameters": every, "nuisance": NUISANCE, "between": between}
-        return words("joint", most=MOST_ROWS, **more, **_common(self))
+        known = [one.misfit for one in self.tests.values()]
+        curves = [n for n in MISFITS if any(misfit.get(n) is not None for misfit in known)]
+        more: Any = {"parameters": every, "nuisance": NUISANCE, "between": _between}
+        return words("joint", found=self, most=MOST_ROWS, curves=curves, **more)
 
     def write(
         self, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
@@ -156,8 +163,8 @@ class JointResult(Result):
         write_json(folder / "joint.json", self.to_json_dict())
         shown = self.of_springs
         kinds = {name: one.kind for name, one in shown.items()}
-        words = {name: between(one) for name, one in shown.items()}
-        write_text(folder / "table.tex", parameters_tex(shown, kinds=kinds, between=words))
+        between = {name: _between(one) for name, one in shown.items()}
+        write_text(folder / "table.tex", parameters_tex(shown, kinds=kinds, between=between))
         folders, n = [folder / name for name in self.tests], len(self.tests)
         # If other processes write these folders, the common figure is drawn at the same time.
         written = mapped(_write_test, self.fits, folders, [pages] * n, [width] * n)
@@ -187,77 +194,41 @@ def _write_test(one: Callable[[], Fit] | Fit, folder: Path, report: bool, width:
     write_result(one if isinstance(one, Fit) else one(), folder, pages=report, width=width)
 
 
-def _common(found: JointResult) -> dict[str, Any]:
-    """Return the values that text and page have in common."""
-    content = found.to_json_dict()
-    tests, evidence = content["tests"].values(), dict[str, list[Mapping[str, Any]]]()
-    for one in content["evidence"]:
-        evidence.setdefault(one["parameter"], []).append(one)
-    known = {name for one in tests for name, x in one["misfit"].items() if x is not None}
-    return {
-        "found": content,
-        "law": law_in_words(Model.of_result(content).name, content["relaxation"]),
-        "evidence": evidence,
-        "curves": {name: label for name, label in MISFITS.items() if name in known},
-        "ranged": any(one.range for one in found.parameters.values()),
-    }
+def _between(one: ParameterEstimate) -> str:
+    """Return a description of the variation of a parameter between the tests."""
+    return words("between", one=one)
 
 
 def joint_page(found: JointResult, folder: Path, figure: bytes) -> str:
     """Return the page in a folder, with its figure (SVG)."""
-    common = _common(found)
-    shown = {n: one for n, one in found.parameters.items() if one.kind != "fixed"}
-    levels: dict[str, tuple[float, str]] = {}  # factor and unit of the noise of each curve
-    known = [one["noise"] for one in common["found"]["tests"].values()]
-    for name in MISFITS:
-        if sizes := [one[name]["sigma"] for one in known if name in one]:
-            levels[name] = readable_unit(max(sizes), "m" if name.startswith("displ") else "Pa")
+    varied = {n: p.tests for n, p in found.parameters.items() if p.kind != "fixed" and p.tests}
     rows = [
         Row(
             test,
-            misfit=own["misfit"],
-            parameters={n: p.in_test(test) for n, p in shown.items() if test in (p.tests or ())},
-            more=_more(own, levels),
+            misfit=own.misfit,
+            parameters={n: found.parameters[n].in_test(test) for n in varied if test in varied[n]},
+            more=_more(found, own),
         )
-        for test, own in common["found"]["tests"].items()
+        for test, own in found.tests.items()
     ]
-    return page(
-        "joint",
-        figure=figure,
-        parameters=[
-            (one, readable(name, one), between(one)) for name, one in found.of_springs.items()
-        ],
-        rule=RULE,
-        table=table_of(rows, folder),
-        **common,
-    )
+    shown = [(one, readable(name, one), _between(one)) for name, one in found.of_springs.items()]
+    told: dict[str, Any] = {"found": found, "figure": figure, "parameters": shown, "rule": RULE}
+    return page("joint", table=table_of(rows, folder), **told)
 
 
-def _more(own: Mapping[str, Any], levels: Mapping[str, tuple[float, str]]) -> dict[str, Any]:
+def _more(found: JointResult, own: JointTest) -> dict[str, Any]:
     """Return the cells of a test that only joint fits have: rate, share of χ² and noise."""
-    rate = "" if own["rate"] is None else f"{own['rate']:.3g}"
-    out = {"rate (1/s)": (rate, ""), "share of χ² (%)": (f"{100 * own['chi2_share']:.1f}", "")}
-    for curve, (factor, unit) in levels.items():
-        if level := own["noise"].get(curve):
-            note = "stated" if level["given"] else "estimated"
-            if level["time"] > 1.05:
-                note += f", correlated over {level['time']:.2g} samples"
-            if level["scale"] > level["sigma"]:
-                note += f", counted as {number(level['scale'] / factor)}"
+    rate = "" if own.rate is None else f"{own.rate:.3g}"
+    out = {"rate (1/s)": (rate, ""), "share of χ² (%)": (f"{100 * own.chi2_share:.1f}", "")}
+    for curve in MISFITS:
+        levels = [one.noise[curve]["sigma"] for one in found.tests.values() if curve in one.noise]
+        if curve in own.noise:
+            unit = "m" if curve.startswith("displ") else "Pa"
+            factor, unit = readable_unit(max(levels), unit)
+            level = own.noise[curve]
+            note = words("noise", level=level, factor=factor)
             out[f"noise {MISFITS[curve]} ({unit})"] = (number(level["sigma"] / factor), note)
     return out
-
-
-def between(one: ParameterEstimate) -> str:
-    """Return a description of the variation of a parameter between the tests."""
-    if one.kind == "scatter" and one.scatter is not None and one.scatter_ci95 is not None:
-        low, high = one.scatter_ci95
-        return f"scatters by {percent(one.scatter)} ({percent(low)} to {percent(high)})"
-    if one.b is not None:
-        ends = "" if one.b_ci95 is None else f" ({one.b_ci95[0]:.3g} to {one.b_ci95[1]:.3g})"
-        return f"b = {one.b:.3g}{ends}"
-    values = [at.value for at in (one.tests or {}).values()] if one.kind == "own" else []
-    return in_unit((min(values), max(values)), one.unit) if values else ""
 
 
 def plot_joint(found: JointResult, *, width: str = TWO) -> Figure:
