@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TYPE_CHECKING, Unpack
 
 import lmfit
@@ -21,7 +22,7 @@ from foamfit.report.shown import Result, brief
 from foamfit.report.summary import compared, summary_text
 from foamfit.report.tables import frame
 from foamfit.results import Fit
-from foamfit.solve.precompile import at_first_use
+from foamfit.solve.precompile import compile_solver
 from foamfit.springs.model import Model
 from foamfit.text import percent
 from foamfit.trust.intervals import Announce
@@ -137,24 +138,24 @@ def fit(
         chosen.check_auto(params=params is not None, priors=measurement.priors)
     else:
         Model.parse(model, chosen.relaxation)
-    with at_first_use(model, chosen.relaxation) as compile_rest:
+    compile_once = cache(lambda: compile_solver(model))
 
-        def part(begin: float, end: float) -> Progress:
-            """Report the progress of a part of the work between two fractions of the whole."""
+    def part(begin: float, end: float) -> Progress:
+        """Report the progress of a part of the work between two fractions of the whole."""
 
-            def shown(share: float, what: str) -> None:
-                compile_rest()  # before the first simulation, after the arguments were checked
-                progress(begin + (end - begin) * share, what)
+        def shown(share: float, what: str) -> None:
+            compile_once()  # before the first simulation, after the arguments were checked
+            progress(begin + (end - begin) * share, what)
 
-            return shown
+        return shown
 
-        if model == "auto":
-            from foamfit.auto import compare_models
+    if model == "auto":
+        from foamfit.auto import compare_models
 
-            found = compare_models(measurement, chosen, part(0.0, 1.0), tell)
-        else:
-            searched = identify(measurement, model, params, chosen, part(0.0, SEARCHED))
-            found, _ = judge(searched, chosen.choice, tell, part(SEARCHED, 1.0))
-            progress(1.0, "done")
-        stored = chosen.stored(measurement, model) if params is None else None
-        return FitResult(**vars(found) | {"options": stored})
+        found = compare_models(measurement, chosen, part(0.0, 1.0), tell)
+    else:
+        searched = identify(measurement, model, params, chosen, part(0.0, SEARCHED))
+        found, _ = judge(searched, chosen.choice, tell, part(SEARCHED, 1.0))
+        progress(1.0, "done")
+    stored = chosen.stored(measurement, model) if params is None else None
+    return FitResult(**vars(found) | {"options": stored})

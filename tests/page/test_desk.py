@@ -252,7 +252,7 @@ def test_a_worker_that_dies_while_it_is_stopped_says_what_it_was(code, errors, t
 
 def test_what_compiles_at_first_use_is_waited_for_and_ends_with_the_page(monkeypatch):
     monkeypatch.setattr(worker_module.cache, "compiled", lambda _: False)
-    monkeypatch.setattr(worker_module, "COMPILE", "import time; time.sleep(60)  # {} {}")
+    monkeypatch.setattr(worker_module, "COMPILE", "import time; time.sleep(60)  # {}")
     first_use = worker_module.FirstUse()
     integrator, memory = first_use.parts
     assert first_use.needed("linear+bistable", 0) is integrator

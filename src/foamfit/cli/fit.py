@@ -183,10 +183,7 @@ def fit(
     """
     output.check(without_report=False)
     model = asked["model"] = model_name(asked)
-    with (
-        options.compiling(output.silent, model, asked["relaxation"]) as compile_rest,
-        closing(options.Drawers()) as drawers,
-    ):
+    with closing(options.Drawers()) as drawers:
         from foamfit.data.toml_file import toml_beside
         from foamfit.report.folder import check_same
 
@@ -201,7 +198,7 @@ def fit(
                 check_same(place, ready.measurement.data_sha256, made)
 
         check(folder)
-        compile_rest()
+        options.compile_solver(output.silent, model)
         if not output.no_report:
             drawers.begin()
         with progress_line(output.silent, "fit", says=not output.quiet) as news:

@@ -77,8 +77,7 @@ def batch(
     from foamfit.study import batch as study
 
     if scheduler is None:
-        with options.compiling(output.silent, asked["model"], search["relaxation"]) as compile_rest:
-            compile_rest()
+        options.compile_solver(output.silent, asked["model"])
     with (
         nullcontext() if scheduler is None else _cluster(scheduler) as executor,
         progress_line(output.silent, "batch") as line,
@@ -171,15 +170,14 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
 
     read = read_study(study)
     output.folder(folder, [path for _, path, _ in read.tests])
-    with options.compiling(output.silent, read.model, read.relaxation) as compile_rest:
-        from foamfit.study.joint import joint as fit_jointly
-        from foamfit.study.joint_result import FEW_FOLDERS
-        from foamfit.study.processes import begin, workers
+    from foamfit.study.joint import joint as fit_jointly
+    from foamfit.study.joint_result import FEW_FOLDERS
+    from foamfit.study.processes import begin, workers
 
-        compile_rest()
-        if not output.no_report:
-            begin(jobs, len(read.tests), FEW_FOLDERS)
-        with progress_line(output.silent, "joint fit") as line:
-            found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress)
-        with workers(jobs, len(found.tests), FEW_FOLDERS) as each:
-            return output.finish(found, folder / "joint.html", mapped=each)
+    options.compile_solver(output.silent, read.model)
+    if not output.no_report:
+        begin(jobs, len(read.tests), FEW_FOLDERS)
+    with progress_line(output.silent, "joint fit") as line:
+        found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress)
+    with workers(jobs, len(found.tests), FEW_FOLDERS) as each:
+        return output.finish(found, folder / "joint.html", mapped=each)

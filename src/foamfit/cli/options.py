@@ -6,8 +6,8 @@ import functools
 import json
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -251,14 +251,8 @@ def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -
         figure_format(plot)
 
 
-@contextmanager
-def compiling(
-    quiet: bool, model: str = "bistable", relaxation: int = 0
-) -> Iterator[Callable[[], None]]:
-    """Compile at first use, in parallel to the body.
-
-    The body calls the function that it receives before it simulates.
-    """
+def compile_solver(quiet: bool, model: str = "bistable") -> None:
+    """Compile at first use what the fit of a model needs, and say so unless `quiet`."""
     from foamfit.solve import cache, precompile
 
     if quiet:  # the log would announce later compilations
@@ -268,8 +262,7 @@ def compiling(
         if not quiet:
             say(f"foamfit: {cache.compiling('the solver')}", err=True)
 
-    with precompile.at_first_use(model, relaxation, tell) as finish:
-        yield finish
+    precompile.compile_solver(model, tell)
 
 
 class Drawers:

@@ -313,8 +313,7 @@ def _executor(given: Executor | None, jobs: int | None, made: Batch) -> Iterator
         yield given
         return
     if not cache.compiled():
-        with precompile.at_first_use() as finish:
-            finish()
+        precompile.compile_solver()
     count = min(jobs or cores(), max(len(made.tests), 1))
     try:
         with Processes(count, (*FITS, *(PAGES if made.recipe.pages else ()))) as pool:
