@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -183,26 +182,23 @@ def fit(
     """
     output.check(without_report=False)
     model = asked["model"] = model_name(asked)
-    with closing(options.Drawers()) as drawers:
-        from foamfit.data.toml_file import toml_beside
-        from foamfit.report.folder import check_same
+    from foamfit.data.toml_file import toml_beside
+    from foamfit.report.folder import check_same
 
-        ready, toml = read_as_asked(test, specimen, asked), toml_beside(test)
-        made = ready.options
-        if specimen not in (None, toml):
-            made["specimen"] = specimen.stem
-        folder = output.folder(Path("fits", toml.stem, folder_name(made)), (test, specimen or toml))
+    ready, toml = read_as_asked(test, specimen, asked), toml_beside(test)
+    made = ready.options
+    if specimen not in (None, toml):
+        made["specimen"] = specimen.stem
+    folder = output.folder(Path("fits", toml.stem, folder_name(made)), (test, specimen or toml))
 
-        def check(place: Path) -> None:
-            if not force:
-                check_same(place, ready.measurement.data_sha256, made)
+    def check(place: Path) -> None:
+        if not force:
+            check_same(place, ready.measurement.data_sha256, made)
 
-        check(folder)
-        options.compile_solver(output.silent, model)
-        if not output.no_report:
-            drawers.begin()
+    check(folder)
+    options.compile_solver(output.silent, model)
+    with options.drawing(not output.no_report) as mapped:
         with progress_line(output.silent, "fit", says=not output.quiet) as news:
             found = replace(ready.fit(news), options=made)
-
         page = folder / ("report.html" if ready.several is None else "cycles.png")
-        return output.finish(found, page, check=check, verbose=verbose, mapped=drawers.map)
+        return output.finish(found, page, check=check, verbose=verbose, mapped=mapped)

@@ -6,8 +6,8 @@ import functools
 import json
 import logging
 import math
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from foamfit.report.result_figures import Mapped
     from foamfit.report.shown import Result
-    from foamfit.study.processes import Processes
 
 Command = Callable[..., Any]
 FILE, WHOLE, COUNT = click.Path(path_type=Path), click.IntRange(min=0), click.IntRange(min=1)
@@ -265,30 +264,27 @@ def compile_solver(quiet: bool, model: str = "bistable") -> None:
     precompile.compile_solver(model, tell)
 
 
-class Drawers:
-    """Two processes that draw figures; with a single core this process draws them."""
+@contextmanager
+def drawing(wanted: bool) -> Iterator[Mapped]:
+    """Yield a `map` that draws figures in two processes, at once, or here with a single core."""
+    from foamfit.study import processes
 
-    _pool: Processes | None = None
+    pool = None
+    if wanted and processes.cores() > 1:
+        with suppress(OSError):  # the system allows no more processes
+            pool = processes.Processes(2, processes.DRAWING)
+    if pool is None:
+        yield map
+        return
 
-    def begin(self) -> None:
-        """Start the processes."""
-        from foamfit.study import processes
-
-        if processes.cores() > 1:
-            with suppress(OSError):  # the system allows no more processes
-                self._pool = processes.Processes(2, processes.DRAWING)
-
-    def map(self, draw: Callable[[str], Any], names: Iterable[str]) -> Iterable[Any]:
-        """Start drawing all figures; iterating over the results waits for each."""
-        if self._pool is None:
-            return map(draw, names)
-        begun = [(name, self._pool.submit(draw, name)) for name in names]
+    def start(draw: Callable[[str], Any], names: Iterable[str]) -> Iterable[Any]:
+        begun = [(name, pool.submit(draw, name)) for name in names]
         return (_drawn(one, draw, name) for name, one in begun)
 
-    def close(self) -> None:
-        """End the processes."""
-        if self._pool is not None:
-            self._pool.stop()
+    try:
+        yield start
+    finally:
+        pool.stop()
 
 
 def _drawn(begun: Future[Any], draw: Callable[[str], Any], name: str) -> Any:
