@@ -39,25 +39,10 @@ def model_name(asked: Mapping[str, Any]) -> str:
     return "auto" if model == "auto" else Model.parse(model, asked["relaxation"]).words
 
 
-def cycles_of(asked: Mapping[str, Any]) -> int | tuple[int, ...] | None:
-    """Return the value of --cycle: a number, several numbers, or () for "all".
-
-    Raises InputError if it is invalid, or if --cycles is given too.
-    """
-    text = asked["cycle"]
-    if text is not None and asked["cycles"] is not None:
-        raise InputError("give either --cycle or --cycles, not both")
-    if text is None or text.strip().lower() == "all":
-        return None if text is None else ()
-    parts = text.split(",")
-    if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
-        raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
-    numbers = tuple(int(part) for part in parts)
-    return numbers if len(numbers) > 1 else numbers[0]
-
-
 def keywords_of(asked: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of a command as keywords of `foamfit.fit`."""
+    if asked["cycle"] is not None and asked["cycles"] is not None:
+        raise InputError("give either --cycle or --cycles, not both")
     given = {way: asked[way] for way in WAYS if asked[way] not in (None, False)}
     if len(given) > 1:
         names = " and ".join(f"--{way}" for way in given)
@@ -105,13 +90,13 @@ def read_as_asked(test: Path, specimen: Path | None, asked: Mapping[str, Any]) -
 
     search = keywords_of(asked)
     model = model_name(asked)
-    wanted = cycles_of(asked)
+    wanted = asked["cycle"]
     several = wanted if isinstance(wanted, tuple) else None
     alone = None if isinstance(wanted, tuple) else wanted
     measurement = read_test(test, specimen, alone, cycles=asked["cycles"])
     for number in set(several or ()).difference(measurement.cycles):
         last = f"its cycles are {min(measurement.cycles)} to {max(measurement.cycles)}"
-        raise InputError(f"--cycle {asked['cycle']}: {test} has no cycle {number}; {last}")
+        raise InputError(f"--cycle {number}: {test} has no cycle {number}; {last}")
     from foamfit.one_model import Options
 
     Options(**search).check(measurement, model)  # fail before anything is compiled

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from foamfit.cli import options
-from foamfit.cli.fit import cycles_of, fit_options, keywords_of
+from foamfit.cli.fit import fit_options, keywords_of
 from foamfit.cli.group import NOT_ACCEPTABLE, main
 from foamfit.cli.options import Output
 from foamfit.cli.progress import progress_line
@@ -68,7 +68,7 @@ def batch(
     if jobs is not None and scheduler is not None:
         raise InputError("--jobs and --scheduler exclude each other; leave one of them out")
     output.check()
-    search, cycles = keywords_of(asked), cycles_of(asked)
+    search, cycles = keywords_of(asked), asked["cycle"]
     from foamfit.study import processes
 
     if scheduler is None:
@@ -172,12 +172,10 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
     output.folder(folder, [path for _, path, _ in read.tests])
     from foamfit.study.joint import joint as fit_jointly
     from foamfit.study.joint_result import FEW_FOLDERS
-    from foamfit.study.processes import begin, workers
+    from foamfit.study.processes import workers
 
     options.compile_solver(output.silent, read.model)
-    if not output.no_report:
-        begin(jobs, len(read.tests), FEW_FOLDERS)
-    with progress_line(output.silent, "joint fit") as line:
-        found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress)
-    with workers(jobs, len(found.tests), FEW_FOLDERS) as each:
+    with workers(jobs, len(read.tests), FEW_FOLDERS) as each:
+        with progress_line(output.silent, "joint fit") as line:
+            found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress)
         return output.finish(found, folder / "joint.html", mapped=each)

@@ -62,6 +62,19 @@ def _range(
     return int(first), int(last)
 
 
+def _cycles(
+    context: click.Context, parameter: click.Parameter, text: str | None
+) -> int | tuple[int, ...] | None:
+    """Return the value of --cycle: a number, several numbers, or () for "all"."""
+    if text is None or text.strip().lower() == "all":
+        return None if text is None else ()
+    parts = text.split(",")
+    if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
+        raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
+    numbers = tuple(int(part) for part in parts)
+    return numbers if len(numbers) > 1 else numbers[0]
+
+
 def _fixes(
     context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
 ) -> dict[str, float] | None:
@@ -81,7 +94,7 @@ def _fixes(
 # Options whose values the command parses by a rule of its own, not by their kind.
 READ: dict[str, dict[str, Any]] = {
     "specimen": {"type": FILE},
-    "cycle": {"type": str},
+    "cycle": {"type": str, "callback": _cycles},
     "cycles": {"type": str, "callback": _range},
     "fix": {"type": str, "multiple": True, "callback": _fixes},
     "vary": {"type": str, "multiple": True},

@@ -90,7 +90,11 @@ def published() -> None:
 @options.TEST
 @options.SPECIMEN
 @options.declared(
-    "cycle", help="Cycle of a slow record. Default: the first.", type=options.COUNT, metavar="N"
+    "cycle",
+    help="Cycle of a slow record. Default: the first.",
+    type=options.COUNT,
+    metavar="N",
+    callback=None,
 )
 @options.CYCLES
 @options.declared("drive", help="Default: the drive of the result.")

@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 
 import tomli_w
 
-from foamfit.cli.fit import cycles_of
 from foamfit.data.csv_file import read_test
 from foamfit.data.energy import audit, describe
 from foamfit.data.measurement import Measurement
@@ -151,7 +150,7 @@ class Desk:
         try:
             toml.write_text(join_toml(quantities, rest), encoding="utf-8")
             asked = parsed([*arguments])
-            wanted = cycles_of(asked)
+            wanted = asked["cycle"]
             first = next(iter(wanted), None) if isinstance(wanted, tuple) else wanted
             measurement = read_test(self.csv, toml, first, cycles=asked["cycles"])
             # The folder of the window means nothing to a user.

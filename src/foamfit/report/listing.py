@@ -281,27 +281,19 @@ def table_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     ]
 
 
-def table(rows: Sequence[Row]) -> pd.DataFrame:
-    """Return the rows of summary.csv as a data frame."""
-    return _frame(table_rows(rows))
-
-
 def read_table(path: Path) -> pd.DataFrame:
     """Read a summary.csv; raise InputError if the file is not one."""
-    try:
-        cells = csv.reader(read_whole(path).decode().splitlines(True))
-        head, *rows = ([re.sub("^'(?=[=+@-])", "", one) or None for one in row] for row in cells)
-        return _frame([dict(zip(head, row, strict=True)) for row in rows])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} is not the summary of a batch: {error}") from None
-
-
-def _frame(rows: list[dict[Any, Any]]) -> pd.DataFrame:
     import pandas as pd
 
     words = ("test", "file", "status", "error")
-    numbers = (name for name in rows[0] if name not in words and not name.endswith("_state"))
-    return pd.DataFrame(rows).astype(dict.fromkeys(numbers, float))
+    try:
+        cells = csv.reader(read_whole(path).decode().splitlines(True))
+        head, *rows = ([re.sub("^'(?=[=+@-])", "", one) or None for one in row] for row in cells)
+        numbers = [name for name in head if name not in words and not str(name).endswith("_state")]
+        table = pd.DataFrame([dict(zip(head, row, strict=True)) for row in rows])
+        return table.astype(dict.fromkeys(numbers, float))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} is not the summary of a batch: {error}") from None
 
 
 def write_summary(rows: Sequence[Row], folder: Path) -> None:

@@ -266,7 +266,7 @@ def batch(
         raise InputError(f"{folder} cannot be written: {reason(error)}") from None
     with _executor(executor, jobs, made) as runner:
         made.fit(runner)
-    return tables.table(made.summary)
+    return tables.read_table(folder / "summary.csv")
 
 
 def _checked(model: str, options: Options) -> str:

@@ -30,7 +30,7 @@ from foamfit.study import joint_fit
 from foamfit.study.joint_fit import Map, fit_jointly
 from foamfit.study.joint_parameters import result_of
 from foamfit.study.joint_result import FEW_FOLDERS, JointResult
-from foamfit.study.processes import begin, workers
+from foamfit.study.processes import workers
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
 from foamfit.trust.settle import follow_samples, keep_to_record, weigh_motion
@@ -99,8 +99,6 @@ def joint(
     study = study if seed is None else replace(study, seed=seed)
     if out is not None:
         try_target(out)
-        if report:
-            begin(jobs, len(study.tests), FEW_FOLDERS)
     options = Options(
         drive=study.drive, seed=study.seed, starts=study.starts, relaxation=study.relaxation
     )
