@@ -29,7 +29,7 @@ from foamfit.solve import cache, precompile
 from foamfit.springs.model import Model, with_options
 from foamfit.study.batch_work import Outcome, Recipe, Task, fingerprint, put, stored, work
 from foamfit.study.processes import FITS, PAGES, EndedError, Processes, cores
-from foamfit.study.test_files import find_tests
+from foamfit.study.study_file import find_tests
 from foamfit.terminal import without_ctrl_c
 from foamfit.text import counted
 
@@ -199,7 +199,7 @@ def batch(
     Parameters
     ----------
     tests : str, Path or several
-        Files, folders and globs; see `foamfit.study.test_files.find_tests`.
+        Files, folders and globs; see `foamfit.study.study_file.find_tests`.
     out : str or Path, optional
         The folder; by default ``fits/batch/<model>``. It contains the result folder ``<test>/``
         of each test, ``summary.csv`` and ``summary.html``.

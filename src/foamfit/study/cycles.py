@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -92,18 +92,9 @@ class CycleFits(Result):
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of cycles.json, in plain types."""
-        content: dict[str, Any] = {
-            "schema": SCHEMA,
-            "foamfit": version("foamfit"),
-            "test": self.test,
-            "model": self.model,
-            "recorded": self.recorded,
-            "fitted": sorted(self.results),
-            "refused": self.refused,
-            "data_sha256": self.data_sha256,
-            "options": self.options,
-        }
-        return dict(plain(content))
+        content = {"schema": SCHEMA, "foamfit": version("foamfit"), "fitted": sorted(self.results)}
+        names = (one.name for one in fields(self) if one.name != "results")
+        return dict(plain(content | {name: getattr(self, name) for name in names}))
 
     def printed(self) -> dict[str, Any]:
         """Return what the command prints as JSON: also the fits."""
