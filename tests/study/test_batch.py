@@ -294,7 +294,7 @@ def test_an_executor_that_ends_is_one_sentence_and_what_is_done_stays(here, trie
 )
 def test_a_wrong_call_is_one_sentence_and_nothing_is_written(here, monkeypatch, words, told):
     # Otherwise the announcement of a compilation could come before the refusal.
-    monkeypatch.setattr(module.cache, "compiled", lambda *_: True)
+    monkeypatch.setattr("foamfit.solve.cache.compiled", lambda *_: True)
     before = sorted(here.rglob("*"))
     assert told in run_refused("batch", *words)
     assert sorted(here.rglob("*")) == before

@@ -25,7 +25,7 @@ from foamfit.report import listing as tables
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import FILES, check_target, is_written
 from foamfit.report.listing import Row
-from foamfit.solve import cache, precompile
+from foamfit.solve import precompile
 from foamfit.springs.model import Model, with_options
 from foamfit.study.batch_work import Outcome, Recipe, Task, fingerprint, put, stored, work
 from foamfit.study.processes import FITS, PAGES, EndedError, Processes, cores
@@ -88,7 +88,7 @@ class Batch:
     def fit(self, executor: Executor) -> None:
         """Fit all tests without a stored result; write a summary even if this ends early."""
         try:
-            for i, (name, path) in enumerate(self.tests):
+            for name, path in self.tests:
                 self._begin(executor, name, path)
                 while (
                     len(self.waiting) >= MOST_AHEAD
@@ -96,8 +96,6 @@ class Batch:
                 ):
                     self._collect(1.0)
                 self._collect(0.0)
-                while i == 0 and not self.foreign and self._is_cold() and self.waiting:
-                    self._collect(1.0)  # the first fit compiles for all others
             while self.waiting:
                 self._collect(1.0)
         except BaseException as error:
@@ -113,13 +111,6 @@ class Batch:
             done = f"{len(self.rows)} of {counted(len(self.tests), 'test')} are done and kept"
             raise InputError(f"{why}; {done}; call again to fit the others") from error
         self.save(whole=True)
-
-    def _is_cold(self) -> bool:
-        """Return whether the first fit compiles functions that the other fits need too."""
-        model = self.recipe.model
-        memory = model == "auto" or self.recipe.options["relaxation"] > 0
-        memory = memory or any(law.remembers for law in Model.parse(model).laws)
-        return memory and not cache.compiled("follow")
 
     def _begin(self, executor: Executor, name: str, path: Path) -> None:
         """Use the stored rows of a test, or submit its fit."""
@@ -312,8 +303,7 @@ def _executor(given: Executor | None, jobs: int | None, made: Batch) -> Iterator
     if given is not None:
         yield given
         return
-    if not cache.compiled():
-        precompile.compile_solver()
+    precompile.compile_solver(made.recipe.model)
     count = min(jobs or cores(), max(len(made.tests), 1))
     try:
         with Processes(count, (*FITS, *(PAGES if made.recipe.pages else ()))) as pool:
