@@ -76,8 +76,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if asked.collectonly or not getattr(asked, "numprocesses", None):
         return
     if not cache.compiled():
-        with precompile.at_first_use() as compile_rest:
-            compile_rest()
+        precompile.compile_solver()
     missing = [part for part, loop in LOOPS.items() if not cache.compiled(loop)]
     judge = ["judge"] if missing else []  # the stability study has a separate cache
     session.config.stash[BEGUN] = [first_use(part) for part in missing + judge]
@@ -105,8 +104,7 @@ def compiled() -> Iterator[None]:
     if cache.compiled():
         yield
         return
-    with precompile.at_first_use() as compile_rest:
-        compile_rest()
+    precompile.compile_solver()
     yield
 
 

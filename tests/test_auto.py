@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import json
 import re
@@ -292,12 +291,7 @@ def test_where_no_model_reaches_the_noise_prediction_decides(monkeypatch, tmp_pa
     small_pictures(monkeypatch)
     folder = result.save(tmp_path / "auto")
     content = json.loads((folder / "fit.json").read_text())["ladder"]
-    with (folder / "ladder.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    for one, rung in zip(rows, content["rungs"], strict=True):
-        assert (one["model"], float(one["bic"])) == (rung["model"], rung["bic"])
-        assert float(one["misfit_stress_strain"]) == rung["misfit"]["stress_strain"]
-        assert one["why"] == rung["why"] != ""
+    assert [one["why"] for one in content["rungs"]] == [one.why for one in ladder.rungs]
     row = content["rungs"][2]
     assert (row["model"], row["relaxation"]) == ("microscale", 1)
     simpler = min(content["rungs"][:2], key=lambda rung: rung["predicted_misfit"])

@@ -175,8 +175,8 @@ def shown(name: str, one: Any, expected: Any) -> dict[str, Any]:
     width = math.nan if one.ci95 is None else one.ci95[1] - one.ci95[0]
     row = {"parameter": name, "value": one.value, "state": one.state, "width": width}
     if expected is not None:
-        row |= {"expected state": expected.state, "expected width": expected.width,
-                "low": expected.ends[0], "high": expected.ends[1]}  # fmt: skip
+        row |= {"expected state": expected.state, "expected width": expected.ci95_width,
+                "low": expected.ci95_width_10_90[0], "high": expected.ci95_width_10_90[1]}  # fmt: skip
     return row
 
 

@@ -9,7 +9,6 @@ from .data.measurement import Measurement as Measurement
 from .errors import InputError as InputError
 from .errors import SimulationError as SimulationError
 from .fitting.problem import make_params as make_params
-from .report.studies.cycles import CycleFits as CycleFits
 from .report.studies.plan import Plan as Plan
 from .report.studies.prediction import Prediction as Prediction
 from .solve.simulation import Response as Response
@@ -49,6 +48,7 @@ from .springs.laws import (
 )
 from .springs.published import published as published
 from .study.batch import batch as batch
+from .study.cycles import CycleFits as CycleFits
 from .study.cycles import fit_cycles as fit_cycles
 from .study.joint import joint as joint
 from .study.joint_result import JointResult as JointResult

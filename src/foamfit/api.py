@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from functools import cache
+from typing import TYPE_CHECKING, Unpack
 
 import lmfit
 from lmfit import Minimizer
@@ -16,17 +15,14 @@ from foamfit.errors import InputError
 from foamfit.fitting.minimizer import minimizer_of, result_of
 from foamfit.one_model import SEARCHED, Options, Progress, identify, judge
 from foamfit.options import Keywords, documented
-from foamfit.report.figures import TWO, inches
-from foamfit.report.folder import save_whole, write_result
+from foamfit.report.folder import dataset, write_result
 from foamfit.report.plots import draw_panel
 from foamfit.report.readable import readable
-from foamfit.report.result_figures import Mapped
-from foamfit.report.samples import dataset
-from foamfit.report.shown import Shown, brief
-from foamfit.report.summary import compared
+from foamfit.report.shown import Result, brief
+from foamfit.report.summary import compared, summary_text
 from foamfit.report.tables import frame
 from foamfit.results import Fit
-from foamfit.solve.precompile import at_first_use
+from foamfit.solve.precompile import compile_solver
 from foamfit.springs.model import Model
 from foamfit.text import percent
 from foamfit.trust.intervals import Announce
@@ -37,8 +33,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-class FitResult(Shown, Fit):
+class FitResult(Result, Fit):
     """Result of a fit: parameters, intervals, curves, status and warnings."""
+
+    write, to_json_dict = write_result, Fit.to_json_dict
 
     def plot(self, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
         """Plot one panel, measured and fitted, into `ax` or into a new figure.
@@ -60,6 +58,10 @@ class FitResult(Shown, Fit):
         """
         return result_of(self)
 
+    def text(self, *, verbose: bool = False) -> str:
+        """Return one screen on the fit, or with `verbose` all of it."""
+        return summary_text(self, verbose=verbose)
+
     def table(self) -> pd.DataFrame:
         """Return one row per parameter, in SI units; the output of its `to_latex` compiles."""
         return frame(self.parameters)
@@ -79,24 +81,6 @@ class FitResult(Shown, Fit):
         line = f"{self.law}, {self.drive} drive · status {self.status} · misfit: {misfits or '–'}"
         rows = [readable(name, p) for name, p in self.parameters.items() if p.state != "fixed"]
         return brief(self.measurement.name, line, rows, html)
-
-    def save(
-        self,
-        folder: str | Path,
-        *,
-        report: bool = True,
-        figure_width: str = TWO,
-        mapped: Mapped = map,
-    ) -> Path:
-        """Write the result folder and return its path; an older folder is replaced at the end.
-
-        Without `report`, neither report.html nor figures are written. `figure_width` is "one" or
-        "two" columns, or a length ("85 mm"); ", untitled" after it omits the titles. `mapped` draws
-        the figures; give the `map` of an executor to draw them in parallel.
-        """
-        inches(figure_width)  # rejects an invalid width
-        drawn: Any = {"pages": report, "width": figure_width, "mapped": mapped}
-        return save_whole(folder, partial(write_result, self, **drawn))
 
 
 @documented
@@ -154,24 +138,24 @@ def fit(
         chosen.check_auto(params=params is not None, priors=measurement.priors)
     else:
         Model.parse(model, chosen.relaxation)
-    with at_first_use(model, chosen.relaxation) as compile_rest:
+    compile_once = cache(lambda: compile_solver(model))
 
-        def part(begin: float, end: float) -> Progress:
-            """Report the progress of a part of the work between two fractions of the whole."""
+    def part(begin: float, end: float) -> Progress:
+        """Report the progress of a part of the work between two fractions of the whole."""
 
-            def shown(share: float, what: str) -> None:
-                compile_rest()  # before the first simulation, after the arguments were checked
-                progress(begin + (end - begin) * share, what)
+        def shown(share: float, what: str) -> None:
+            compile_once()  # before the first simulation, after the arguments were checked
+            progress(begin + (end - begin) * share, what)
 
-            return shown
+        return shown
 
-        if model == "auto":
-            from foamfit.auto import compare_models
+    if model == "auto":
+        from foamfit.auto import compare_models
 
-            found = compare_models(measurement, chosen, part(0.0, 1.0), tell)
-        else:
-            searched = identify(measurement, model, params, chosen, part(0.0, SEARCHED))
-            found, _ = judge(searched, chosen.choice, tell, part(SEARCHED, 1.0))
-            progress(1.0, "done")
-        stored = chosen.stored(measurement, model) if params is None else None
-        return FitResult(**vars(found) | {"options": stored})
+        found = compare_models(measurement, chosen, part(0.0, 1.0), tell)
+    else:
+        searched = identify(measurement, model, params, chosen, part(0.0, SEARCHED))
+        found, _ = judge(searched, chosen.choice, tell, part(SEARCHED, 1.0))
+        progress(1.0, "done")
+    stored = chosen.stored(measurement, model) if params is None else None
+    return FitResult(**vars(found) | {"options": stored})

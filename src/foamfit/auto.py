@@ -20,7 +20,7 @@ from typing import Any
 import lmfit
 import numpy as np
 
-from foamfit import one_model, text
+from foamfit import one_model
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
@@ -357,12 +357,7 @@ def _conclude(state: _Comparison) -> Fit:
     result, ended = best.result, f"it was stopped by {stopped}" if stopped else state.ended
     told: dict[str, Any] = {"tried": tried, "decision": decision, "best": best, "ended": ended}
     told |= {"stopped": stopped, "lost": best.states("not determined"), "sound": None, "left": None}
-    others = []
-    for name in ("AICc", "BIC"):
-        values = [getattr(one, name.lower()) for one in criteria]
-        least = int(np.argmin(values))
-        if (off := values[least] - values[decision.best]) < -MARGIN:
-            others.append((name, tried[least].name, _signed(off)))
+    told |= {"blocks": BLOCKS, "share": SHARE, "bent": BENT, "margin": MARGIN}
     sound = [i for i, one in enumerate(tried) if not one.states("not determined")]
     if told["lost"] and sound:
         costs = [tried[i].misfit if decision.by_prediction else criteria[i].bic for i in sound]
@@ -374,7 +369,6 @@ def _conclude(state: _Comparison) -> Fit:
         worst = int(np.argmin(tests))
         left = find_structure(best.curves[worst], best.places[worst])
         told |= {"left": left, "curve": best.counted[worst], "size": left.size / best.spans[worst]}
-    told |= {"others": others, "blocks": BLOCKS, "share": SHARE, "bent": BENT}
     said = render.sentences("choice", part="choice", **told)
     warned = render.sentences("choice", part="cautions", **told)
     reference = evidence.reference_of(tried)
@@ -401,43 +395,24 @@ def _conclude(state: _Comparison) -> Fit:
 
 def _rung(i: int, tried: Sequence[Tried], decision: evidence.Decision) -> Rung:
     """Return the row of model `i` in the comparison, with the reason for its rank."""
-    one, best, result = tried[i], tried[decision.best], tried[i].result
-    found, chosen = decision.criteria[i], decision.criteria[decision.best]
-    before, ruler = (
-        None if j is None else tried[j] for j in (decision.before[i], decision.ruled_out_by[i])
-    )
-    gain = None
+    one, result, found, place = tried[i], tried[i].result, decision.criteria[i], decision.before[i]
+    before, gain = None if place is None else tried[place], None
     if before and one.predicted is not None and before.predicted is not None:
         gain = 1.0 - one.predicted / before.predicted
-    told: dict[str, Any] = {
-        "one": one,
-        "best": best,
-        "before": before,
-        "ruler": ruler,
-        "gain": gain,
-    }
-    told |= {"chosen": one is best, "more": one.varied - before.varied if before else 0}
-    told |= {"by_prediction": decision.by_prediction, "worse": evidence.WORSE, "share": SHARE}
-    told |= {"richest": one.varied >= max(each.varied for each in tried), "margin": MARGIN}
-    told |= {"bic": _signed(found.bic - chosen.bic), "aicc": _signed(found.aicc - chosen.aicc)}
+    told: dict[str, Any] = {"i": i, "tried": tried, "decision": decision, "before": before}
+    told |= {"gain": gain, "worse": evidence.WORSE, "share": SHARE, "margin": MARGIN}
     return Rung(
         **{name: getattr(result, name) for name in ("model", "relaxation", "stopped")},
         **{name: getattr(one, name) for name in ("damping", "chisqr", "runs_p", "neighbours_p")},
         **{name: getattr(found, name) for name in ("rank", "aicc", "bic")},
-        seconds=one.seconds,
+        **{name: getattr(one, name) for name in ("seconds", "n_eff")},
         misfit=dict(result.misfit),
         n_vary=one.varied,
-        n_eff=one.n_eff,
         not_determined=one.states("not determined"),
         weak=one.states("weak"),
-        chosen=one is best,
+        chosen=i == decision.best,
         why=render.words("why", **told).replace("\n", ""),
         predicted_misfit=one.predicted,
         gain=gain,
         gain_over=before.name if before else None,
     )
-
-
-def _signed(value: float) -> str:
-    """Format a difference of AICc or BIC; AICc is undefined with too few effective samples."""
-    return text.signed(value, 1) if math.isfinite(value) else "not defined"

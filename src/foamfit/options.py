@@ -71,21 +71,18 @@ class Option:
             return f"positive, in {self.unit}"
         return f"a mapping like {self.like}" if self.kind == "mapping" else ""
 
-    def check(self, value: Any) -> None:
-        """Raise InputError if a value is not admissible; None is the default."""
+    def admits(self, value: Any) -> bool:
+        """Return whether a value is admissible; None is the default."""
         if (value is None and self.default is None) or not self.right:
-            return
+            return True
         if self.choices:
-            valid = value in self.choices
-        elif self.kind == "int":
+            return value in self.choices
+        if self.kind == "int":
             most = math.inf if self.most is None else self.most
-            valid = isinstance(value, Integral) and self.least <= int(value) <= most
-        elif self.kind == "float":
-            valid = isinstance(value, Real) and float(value) > 0
-        else:
-            valid = isinstance(value, Mapping)
-        if not valid:
-            raise InputError(f"{self.name} = {value!r} is not admissible; it must be {self.right}")
+            return isinstance(value, Integral) and self.least <= int(value) <= most
+        if self.kind == "float":
+            return isinstance(value, Real) and float(value) > 0
+        return isinstance(value, Mapping)
 
 
 def option(told: str, default: Any = None, **more: Any) -> Any:
@@ -186,7 +183,8 @@ class Given:
     def __post_init__(self) -> None:
         """Reject inadmissible values."""
         for name, one in OF_FIT.items():
-            one.check(getattr(self, name))
+            if not one.admits(value := getattr(self, name)):
+                raise InputError(f"{name} = {value!r} is not admissible; it must be {one.right}")
 
 
 class Keywords(TypedDict, total=False):

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from foamfit.codec import plain
 from foamfit.options import FREED
 from foamfit.text import counted, listed
 
@@ -150,18 +149,6 @@ class Ladder:
     def chosen(self) -> Rung:
         """The model of the result."""
         return next(rung for rung in self.rungs if rung.chosen)
-
-    def rows(self) -> Iterator[dict[str, object]]:
-        """Yield the rows of ladder.csv; names in a list are separated by spaces."""
-        misfits = [rung.misfit for rung in self.rungs]
-        curves = [name for name in misfits[0] if any(one.get(name) is not None for one in misfits)]
-        for rung in self.rungs:
-            row: dict[str, Any] = plain(rung)
-            misfit = row.pop("misfit")
-            cells = {"model": row.pop("model"), "damping": row.pop("damping")}
-            cells |= {f"misfit_{name}": misfit.get(name) for name in curves}
-            cells |= {k: " ".join(v) if isinstance(v, list) else v for k, v in row.items()}
-            yield cells
 
 
 def law_in_words(model: str, relaxation: int) -> str:

@@ -232,6 +232,13 @@ def loop_of(test: Measurement, along: Array | None, over_time: Array | None) -> 
     return Loop(test.name, test.time, "time (s)", test.stress, over_time)
 
 
+def flags_of(test: Measurement) -> dict[str, Array]:
+    """Return columns of flags: which samples are left out as outliers, and which are measured."""
+    left = {f"outliers of {name} left out": one.left_out for name, one in test.outliers.items()}
+    seen = {f"{name} is measured": sampled for name, sampled in test.sampled.items()}
+    return {name: flags.astype(int) for name, flags in (left | seen).items()}
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Result of a fit."""
@@ -442,11 +449,8 @@ class Fit:
         for node, (measured, fitted) in c.interior.items():
             columns[f"measured {interior_channel(node)} (m)"] = measured
             columns[f"fitted {interior_channel(node)} (m)"] = fitted
-        for channel, outliers in test.outliers.items():
-            columns[f"outliers of {channel} left out"] = outliers.left_out.astype(int)
-        for channel, sampled in test.sampled.items():
-            columns[f"{channel} is measured"] = sampled.astype(int)
-        return {name: column for name, column in columns.items() if column is not None}
+        known = {name: column for name, column in columns.items() if column is not None}
+        return known | flags_of(test)
 
     def _derived(self) -> dict[str, dict[str, Any]]:
         """Return the derived points of the springs, and their largest snapped fraction."""

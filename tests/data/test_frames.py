@@ -12,7 +12,7 @@ from foamfit.data.frames import Frames, join
 from foamfit.data.measurement import Record
 from foamfit.fitting.problem import make_problem
 from foamfit.study.batch_work import fingerprint
-from foamfit.study.test_files import find_tests
+from foamfit.study.study_file import find_tests
 
 LAST = 4e-3  # s
 SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'

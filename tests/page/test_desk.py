@@ -24,7 +24,7 @@ from foamfit.page.desk import Desk, join_toml, safe_name, split_toml, wrong_quan
 from foamfit.page.turning import Turning
 from foamfit.page.worker import News, Worker
 from foamfit.report.folder import load_result
-from foamfit.report.studies import cycles as cycles_report
+from foamfit.study import cycles as cycles_report
 
 TEST = EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv"
 GOOD = {
@@ -252,7 +252,7 @@ def test_a_worker_that_dies_while_it_is_stopped_says_what_it_was(code, errors, t
 
 def test_what_compiles_at_first_use_is_waited_for_and_ends_with_the_page(monkeypatch):
     monkeypatch.setattr(worker_module.cache, "compiled", lambda _: False)
-    monkeypatch.setattr(worker_module, "COMPILE", "import time; time.sleep(60)  # {} {}")
+    monkeypatch.setattr(worker_module, "COMPILE", "import time; time.sleep(60)  # {}")
     first_use = worker_module.FirstUse()
     integrator, memory = first_use.parts
     assert first_use.needed("linear+bistable", 0) is integrator

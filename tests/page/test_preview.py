@@ -3,7 +3,7 @@
 import pytest
 
 from foamfit.errors import InputError
-from foamfit.page.preview import preview, remedies, with_column
+from foamfit.page.desk import preview, remedies, with_column
 
 ROWS = "\n".join(f"{0.01 * k},{k},{0.02 * k}" for k in range(60))
 

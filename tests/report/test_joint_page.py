@@ -14,9 +14,9 @@ from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
 from foamfit.fitting.together import Together
 from foamfit.report.figures import image
-from foamfit.report.studies.joint import joint_page, plot_compared, plot_joint
 from foamfit.study.joint_fit import Alternative, fit_jointly
-from foamfit.study.joint_result import JointResult, result_of
+from foamfit.study.joint_parameters import result_of
+from foamfit.study.joint_result import JointResult, joint_page, plot_joint
 from foamfit.study.study_file import Study
 
 RATES = (0.01, 0.1, 1.0)
@@ -73,7 +73,7 @@ def page(found, tmp_path_factory) -> str:
     folder = tmp_path_factory.mktemp("joint")
     (folder / "<i>third</i>").mkdir(parents=True)
     (folder / "<i>third</i>" / "report.html").write_text("")
-    return joint_page(found, folder, b"<svg/>", b"<svg/>")
+    return joint_page(found, folder, b"<svg/>")
 
 
 def test_the_page_needs_nothing_else_and_escapes_names(page):
@@ -96,24 +96,25 @@ def test_the_page_has_every_parameter_and_test(found, page):
     assert page.count("<td>log rate</td>") == 2  # in the parameter and evidence tables
 
 
-def test_the_picture_has_a_loop_for_each_test_and_a_panel_for_each_law_of_rate(found):
+def test_the_picture_has_the_loops_and_the_law_of_rate(found):
     figure = plot_joint(found)
-    titles = [ax.get_title() for part in figure.subfigs for ax in part.axes]
-    assert titles[:4] == [
-        "first, 0.01/s", "second, 0.1/s", "<i>third</i>, 1/s", "sigma_plus (kPa): log rate",
+    loops = figure.subfigs[0].axes[0]
+    assert [line.get_label() for line in loops.lines][1::2] == [
+        "first, 0.01/s", "second, 0.1/s", "<i>third</i>, 1/s",
     ]  # fmt: skip
-    panel = figure.subfigs[1].axes[0]
-    assert panel.get_xscale() == "log"
-    law = panel.lines[0].get_ydata()
+    panel = next(ax for ax in figure.subfigs[1].axes if ax.get_label() == "s1_sigma_plus")
+    assert panel.get_xlabel().startswith("log rate, b = 0.0")
+    law = next(line for line in panel.lines if line.get_label() == "common").get_xdata()
     assert law[-1] / law[0] == pytest.approx((1 + 0.05 * 2.303) / (1 - 0.05 * 2.303), rel=0.02)
     assert image(figure, "png", 50).startswith(b"\x89PNG")
 
 
 def test_parameters_stand_side_by_side(found):
-    figure = plot_compared(found)
-    panels = {ax.get_label(): ax for ax in figure.axes if ax.axison}
+    figure = plot_joint(found)
+    axes = figure.subfigs[1].axes
+    panels = {ax.get_label(): ax for ax in axes if ax.axison}
     assert list(panels) == [name for name in found.parameters if name in KINDS]
-    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == [
+    assert [text.get_text() for text in axes[0].get_yticklabels()] == [
         "first, 0.01/s", "second, 0.1/s", "<i>third</i>, 1/s",
     ]  # fmt: skip
     key = [text.get_text() for text in figure.legends[0].get_texts()]
@@ -129,9 +130,9 @@ def test_parameters_stand_side_by_side(found):
         for t, one in found.parameters["s1_kc"].tests.items()
     }
     kc = replace(found.parameters["s1_kc"], tests=lost)
-    figure = plot_compared(replace(found, parameters={"s1_kc": kc}), width="one")
+    figure = plot_joint(replace(found, parameters={"s1_kc": kc}), width="one")
     assert figure.get_figwidth() == 3.25
-    assert figure.axes[0].get_xlim()[1] < 1e3
+    assert figure.subfigs[1].axes[0].get_xlim()[1] < 1e3
     assert "beyond the panel" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 

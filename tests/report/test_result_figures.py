@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 from concurrent.futures import Future
-from contextlib import closing
 from typing import Any
 
 import pytest
@@ -14,7 +13,7 @@ import pytest
 import fabricated
 import foamfit.study.processes
 from conftest import EXPERIMENTS
-from foamfit.cli.options import Drawers
+from foamfit.cli.options import drawing
 from foamfit.report.result_figures import Images, draw_all
 from foamfit.study.processes import EndedError
 
@@ -27,9 +26,8 @@ def drawn_here() -> dict[str, Images | None]:
 
 
 def test_other_processes_draw_the_same(drawn_here: dict[str, Images | None]) -> None:
-    with closing(Drawers()) as drawers:
-        drawers.begin()
-        assert dict(draw_all(fabricated.result(), mapped=drawers.map)) == drawn_here
+    with drawing(True) as mapped:
+        assert dict(draw_all(fabricated.result(), mapped=mapped)) == drawn_here
     fit = drawn_here["fit"]
     assert fit is not None
     assert fit.png.startswith(b"\x89PNG")
@@ -52,9 +50,8 @@ def test_where_processes_end_this_one_draws(
 
     monkeypatch.setattr(foamfit.study.processes.Processes, "submit", ended)
     monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 2)
-    with closing(Drawers()) as drawers:
-        drawers.begin()
-        assert list(drawers.map(str.upper, ["fit", "shown"])) == ["FIT", "SHOWN"]
+    with drawing(True) as mapped:
+        assert list(mapped(str.upper, ["fit", "shown"])) == ["FIT", "SHOWN"]
 
 
 def a_process(code: str, *arguments: str) -> tuple[str, set[str]]:

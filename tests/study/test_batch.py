@@ -23,7 +23,7 @@ import fabricated
 import foamfit as ff
 from conftest import HEIGHT, run, run_refused, synthetic_impact, write_csv
 from foamfit.cli import many as command
-from foamfit.report.studies.batch import Row, row_of, write_comparison, write_page
+from foamfit.report.listing import Row, row_of, write_comparison, write_page
 from foamfit.study import batch as module
 from foamfit.study import batch_work
 from foamfit.study.batch_work import work
@@ -294,7 +294,7 @@ def test_an_executor_that_ends_is_one_sentence_and_what_is_done_stays(here, trie
 )
 def test_a_wrong_call_is_one_sentence_and_nothing_is_written(here, monkeypatch, words, told):
     # Otherwise the announcement of a compilation could come before the refusal.
-    monkeypatch.setattr(module.cache, "compiled", lambda *_: True)
+    monkeypatch.setattr("foamfit.solve.cache.compiled", lambda *_: True)
     before = sorted(here.rglob("*"))
     assert told in run_refused("batch", *words)
     assert sorted(here.rglob("*")) == before

@@ -20,7 +20,7 @@ from conftest import (
     without_pictures,
 )
 from cycled import ONSETS, SETS, write_record
-from foamfit.report.studies import cycles as cycles_report
+from foamfit.study import cycles as cycles_report
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from scipy import stats
 
 import foamfit as ff
 from conftest import few_bytes, run, run_refused, without_pictures, write_csv
-from foamfit.report.studies import joint as joint_report
 from foamfit.study import joint_fit
+from foamfit.study import joint_result as joint_report
 from foamfit.study.identified import read_source
 
 HEIGHT, TOP = 10e-3, 0.5
@@ -103,7 +103,7 @@ def coarse(figure, place, *_):
 def test_linked_values_are_one_value_bit_for_bit(found, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
     monkeypatch.setattr(joint_report.figures, "write_both", coarse)
-    found.save(tmp_path / "out", jobs=1)
+    found.save(tmp_path / "out")
     content = json.loads((tmp_path / "out" / "joint.json").read_text())
     value = content["parameters"]["s1_k0"]["value"]
     for test in content["tests"]:
@@ -124,7 +124,7 @@ def test_linked_values_are_one_value_bit_for_bit(found, tmp_path, monkeypatch):
         assert one.name == other.name
         np.testing.assert_array_equal(one.along, other.along)
         np.testing.assert_allclose(one.fitted, other.fitted)
-    read.save(tmp_path / "again", jobs=1)
+    read.save(tmp_path / "again")
     for name in ("joint.json", "joint.html", "table.tex", "t1/curves.csv", "t1/parameters.csv"):
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
     table = read.table().loc["t1"]

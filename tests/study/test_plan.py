@@ -74,7 +74,7 @@ def test_published_foam_1_closes_its_loop_at_the_velocity_of_the_energy_balance(
 def test_a_soft_hit_is_followed_by_one_that_probably_closes_the_loop(planned):
     best = planned.advice
     assert best.breaks <= 0.05
-    assert best.number > sum(one.chance for one in planned.now.values()) + 1.0
+    assert best.number > sum(one.probability for one in planned.now.values()) + 1.0
     softer = [one for one in planned.outcomes if one.candidate.velocity < 1.7]
     assert all("s1_kc" not in one.determined for one in softer if one.candidate.mass == 7e-3)
 
@@ -126,7 +126,7 @@ def test_expected_widths_are_those_of_a_joint_fit_with_the_advised_test(of_publi
     joint = ff.joint(tmp_path / "both.toml", jobs=1)
     for name in names:
         low, high = joint.parameters[name].ci95
-        width = found.advice.expected[name].width
+        width = found.advice.expected[name].ci95_width
         assert 1 / 1.5 < (high - low) / width < 1.5, (name, high - low, width)
         assert joint.parameters[name].state == "determined"
 
@@ -213,7 +213,7 @@ def test_a_slow_test_is_followed_by_cycles_and_holds():
     found = ff.plan(result)
     kinds = {(one.candidate.drive, one.candidate.hold > 0.0) for one in found.outcomes}
     assert kinds == {("displacement", False), ("displacement", True)}
-    assert found.advice.number >= sum(one.chance for one in found.now.values())
+    assert found.advice.number >= sum(one.probability for one in found.now.values())
     fast = [one for one in found.outcomes if one.candidate.rate > 1.0]
     slow = [one for one in found.outcomes if one.candidate.rate < 0.1]
     share = {id(one): one.expected["s1_tau1"].share for one in (*fast, *slow)}

@@ -18,7 +18,6 @@ from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.problem import make_problem
 from foamfit.report.studies import prediction as prediction_report
-from foamfit.report.studies.prediction import prediction_text
 from foamfit.study.identified import read_source
 from foamfit.study.population import Population
 
@@ -380,7 +379,7 @@ def test_a_rate_outside_the_fitted_ones_is_refused_unless_it_is_wanted():
         assert word in str(refused.value)
     found = ff.predict(content, loop(rate=0.5, seed=0), extrapolate=True, draws=DRAWS)
     assert found.extrapolated
-    assert "Extrapolation: its rate, 0.5 1/s" in prediction_text(found).replace("\n  ", " ")
+    assert "Extrapolation: its rate, 0.5 1/s" in found.text().replace("\n  ", " ")
     told = found.to_json_dict()
     assert told["extrapolated"]
     assert any("Extrapolation" in one for one in told["warnings"])

@@ -3,7 +3,7 @@
 import pytest
 
 from foamfit.errors import InputError
-from foamfit.study.test_files import find_tests
+from foamfit.study.study_file import find_tests
 
 
 @pytest.fixture

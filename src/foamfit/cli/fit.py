@@ -5,24 +5,21 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foamfit.cli import options
-from foamfit.cli.group import NOT_ACCEPTABLE, main
+from foamfit.cli.group import main
 from foamfit.cli.options import Output
 from foamfit.cli.progress import Progress, progress_line
 from foamfit.errors import InputError
 from foamfit.options import FREED, OPTIONS
-from foamfit.terminal import say
 
 if TYPE_CHECKING:
     from foamfit.api import FitResult
     from foamfit.data.measurement import Measurement
-    from foamfit.report.studies.cycles import CycleFits
+    from foamfit.study.cycles import CycleFits
 
 # Options that are not keywords of `foamfit.fit`, and options that select its `intervals`.
 NO_KEYWORDS, WAYS = ("cycle", "cycles", "model"), ("profile", "mcmc")
@@ -42,25 +39,10 @@ def model_name(asked: Mapping[str, Any]) -> str:
     return "auto" if model == "auto" else Model.parse(model, asked["relaxation"]).words
 
 
-def cycles_of(asked: Mapping[str, Any]) -> int | tuple[int, ...] | None:
-    """Return the value of --cycle: a number, several numbers, or () for "all".
-
-    Raises InputError if it is invalid, or if --cycles is given too.
-    """
-    text = asked["cycle"]
-    if text is not None and asked["cycles"] is not None:
-        raise InputError("give either --cycle or --cycles, not both")
-    if text is None or text.strip().lower() == "all":
-        return None if text is None else ()
-    parts = text.split(",")
-    if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
-        raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
-    numbers = tuple(int(part) for part in parts)
-    return numbers if len(numbers) > 1 else numbers[0]
-
-
 def keywords_of(asked: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of a command as keywords of `foamfit.fit`."""
+    if asked["cycle"] is not None and asked["cycles"] is not None:
+        raise InputError("give either --cycle or --cycles, not both")
     given = {way: asked[way] for way in WAYS if asked[way] not in (None, False)}
     if len(given) > 1:
         names = " and ".join(f"--{way}" for way in given)
@@ -108,13 +90,13 @@ def read_as_asked(test: Path, specimen: Path | None, asked: Mapping[str, Any]) -
 
     search = keywords_of(asked)
     model = model_name(asked)
-    wanted = cycles_of(asked)
+    wanted = asked["cycle"]
     several = wanted if isinstance(wanted, tuple) else None
     alone = None if isinstance(wanted, tuple) else wanted
     measurement = read_test(test, specimen, alone, cycles=asked["cycles"])
     for number in set(several or ()).difference(measurement.cycles):
         last = f"its cycles are {min(measurement.cycles)} to {max(measurement.cycles)}"
-        raise InputError(f"--cycle {asked['cycle']}: {test} has no cycle {number}; {last}")
+        raise InputError(f"--cycle {number}: {test} has no cycle {number}; {last}")
     from foamfit.one_model import Options
 
     Options(**search).check(measurement, model)  # fail before anything is compiled
@@ -185,52 +167,23 @@ def fit(
     """
     output.check(without_report=False)
     model = asked["model"] = model_name(asked)
-    with (
-        options.compiling(output.silent, model, asked["relaxation"]) as compile_rest,
-        closing(options.Drawers()) as drawers,
-    ):
-        from foamfit.data.toml_file import toml_beside
-        from foamfit.report.folder import check_same
+    from foamfit.data.toml_file import toml_beside
+    from foamfit.report.folder import check_same
 
-        ready, toml = read_as_asked(test, specimen, asked), toml_beside(test)
-        made = ready.options
-        if specimen not in (None, toml):
-            made["specimen"] = specimen.stem
-        folder = output.folder(Path("fits", toml.stem, folder_name(made)), (test, specimen or toml))
+    ready, toml = read_as_asked(test, specimen, asked), toml_beside(test)
+    made = ready.options
+    if specimen not in (None, toml):
+        made["specimen"] = specimen.stem
+    folder = output.folder(Path("fits", toml.stem, folder_name(made)), (test, specimen or toml))
 
-        def check(place: Path) -> None:
-            if not force:
-                check_same(place, ready.measurement.data_sha256, made)
+    def check(place: Path) -> None:
+        if not force:
+            check_same(place, ready.measurement.data_sha256, made)
 
-        check(folder)
-        compile_rest()
-        if not output.no_report:
-            drawers.begin()
+    check(folder)
+    options.compile_solver(output.silent, model)
+    with options.drawing(not output.no_report) as mapped:
         with progress_line(output.silent, "fit", says=not output.quiet) as news:
             found = replace(ready.fit(news), options=made)
-
-        def save(place: Path, **how: Any) -> None:
-            check(place)  # again, for another fit may have written there in the meantime
-            found.save(place, **how)
-
-        from foamfit.report.studies.cycles import cycles_text
-        from foamfit.report.summary import summary_text
-        from foamfit.results import Fit
-
-        if isinstance(found, Fit):
-            page, which, failed = "report.html", "", found.status == "failed"
-            content, text = found.to_json_dict, partial(summary_text, found, verbose=verbose)
-        else:
-            page, which = "cycles.png", " of any cycle"
-            failed = all(one.status == "failed" for one in found.results.values())
-            content, text = partial(_content_of, found), partial(cycles_text, found)
-        output.finish(save, folder / page, content, text, mapped=drawers.map)
-    if failed:
-        say(f"foamfit: no acceptable fit{which} was found; see {folder}", err=True)
-    return NOT_ACCEPTABLE if failed else 0
-
-
-def _content_of(found: CycleFits) -> dict[str, Any]:
-    """Return the fits of several cycles as content of a JSON file."""
-    each = {n: one.to_json_dict() for n, one in sorted(found.results.items())}
-    return found.to_json_dict() | {"cycles": each}
+        page = folder / ("report.html" if ready.several is None else "cycles.png")
+        return output.finish(found, page, check=check, verbose=verbose, mapped=mapped)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from foamfit.cli import options
-from foamfit.cli.fit import cycles_of, fit_options, keywords_of
+from foamfit.cli.fit import fit_options, keywords_of
 from foamfit.cli.group import NOT_ACCEPTABLE, main
 from foamfit.cli.options import Output
 from foamfit.cli.progress import progress_line
@@ -69,47 +68,41 @@ def batch(
     if jobs is not None and scheduler is not None:
         raise InputError("--jobs and --scheduler exclude each other; leave one of them out")
     output.check()
-    search, cycles = keywords_of(asked), cycles_of(asked)
+    search, cycles = keywords_of(asked), asked["cycle"]
     from foamfit.study import processes
 
     if scheduler is None:
         processes.prepare((*processes.FITS, *(() if output.no_report else processes.PAGES)))
-    from foamfit.report.studies.batch import summary_words, table_rows
-    from foamfit.study.batch import run
-    from foamfit.study.batch_work import Recipe
+    from foamfit.report.listing import summary_words, table_rows
+    from foamfit.study import batch as study
 
-    recipe = Recipe(
-        model=asked["model"],
-        options=search,
-        cycles=cycles,
-        pages=not output.no_report,
-        width=output.figure_width,
-        history=asked["cycles"],
-    )
     if scheduler is None:
-        with options.compiling(output.silent, recipe.model, search["relaxation"]) as compile_rest:
-            compile_rest()
+        options.compile_solver(output.silent, asked["model"])
     with (
         nullcontext() if scheduler is None else _cluster(scheduler) as executor,
         progress_line(output.silent, "batch") as line,
     ):
+        found: list[Batch] = []
 
         def tell(made: Batch) -> None:
+            found[:] = [made]
             done, left = len(made.rows), len(made.tests) - len(made.rows)
             state = f"{done} done, {made.wrong} without a fit, {left} left"
             line.progress(made.fitted / max(made.fitted + left, 1), state)
 
-        where: Any = {"out": output.out, "executor": executor, "jobs": jobs, "progress": tell}
-        found = run(tests, recipe, fresh=fresh, specimen=specimen, **where)
-    rows = found.summary
+        how: Any = {"report": not output.no_report, "figure_width": output.figure_width}
+        how |= {"cycle": "all" if cycles == () else cycles, "cycles": asked["cycles"]}
+        how |= {"executor": executor, "jobs": jobs, "fresh": fresh, "specimen": specimen}
+        study.batch(tests, out=output.out, model=asked["model"], progress=tell, **how, **search)
+    rows, folder = found[0].summary, found[0].out
 
     output.show(lambda: table_rows(rows), lambda: summary_words(rows))
-    output.tell_written(found.out / "summary.html")
+    output.tell_written(folder / "summary.html")
     wrong = sum(not row.has_fit for row in rows)
     if not wrong:
         return 0
     have = "has" if wrong == 1 else "have"
-    summary = found.out / "summary.csv"
+    summary = folder / "summary.csv"
     say(f"foamfit: {wrong} of {len(rows)} tests {have} no acceptable fit; see {summary}", err=True)
     return NOT_ACCEPTABLE
 
@@ -177,20 +170,12 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
 
     read = read_study(study)
     output.folder(folder, [path for _, path, _ in read.tests])
-    with options.compiling(output.silent, read.model, read.relaxation) as compile_rest:
-        from foamfit.report.studies.joint import joint_text
-        from foamfit.study.joint import joint as fit_jointly
-        from foamfit.study.joint_result import FEW_FOLDERS
-        from foamfit.study.processes import begin
+    from foamfit.study.joint import joint as fit_jointly
+    from foamfit.study.joint_result import FEW_FOLDERS
+    from foamfit.study.processes import workers
 
-        compile_rest()
-        if not output.no_report:
-            begin(jobs, len(read.tests), FEW_FOLDERS)
+    options.compile_solver(output.silent, read.model)
+    with workers(jobs, len(read.tests), FEW_FOLDERS) as each:
         with progress_line(output.silent, "joint fit") as line:
             found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress)
-        page, text = folder / "joint.html", partial(joint_text, found)
-        output.finish(found.save, page, found.to_json_dict, text, jobs=jobs)
-    if found.status != "failed":
-        return 0
-    say(f"foamfit: no acceptable fit was found; see {folder}", err=True)
-    return NOT_ACCEPTABLE
+        return output.finish(found, folder / "joint.html", mapped=each)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from foamfit.cli.group import NOT_ACCEPTABLE
 from foamfit.cli.progress import progress_line
 from foamfit.errors import InputError
 from foamfit.files import check_file
@@ -23,7 +24,8 @@ from foamfit.terminal import say, without_ctrl_c
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-    from foamfit.study.processes import Processes
+    from foamfit.report.result_figures import Mapped
+    from foamfit.report.shown import Result
 
 Command = Callable[..., Any]
 FILE, WHOLE, COUNT = click.Path(path_type=Path), click.IntRange(min=0), click.IntRange(min=1)
@@ -60,6 +62,19 @@ def _range(
     return int(first), int(last)
 
 
+def _cycles(
+    context: click.Context, parameter: click.Parameter, text: str | None
+) -> int | tuple[int, ...] | None:
+    """Return the value of --cycle: a number, several numbers, or () for "all"."""
+    if text is None or text.strip().lower() == "all":
+        return None if text is None else ()
+    parts = text.split(",")
+    if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
+        raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
+    numbers = tuple(int(part) for part in parts)
+    return numbers if len(numbers) > 1 else numbers[0]
+
+
 def _fixes(
     context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
 ) -> dict[str, float] | None:
@@ -79,7 +94,7 @@ def _fixes(
 # Options whose values the command parses by a rule of its own, not by their kind.
 READ: dict[str, dict[str, Any]] = {
     "specimen": {"type": FILE},
-    "cycle": {"type": str},
+    "cycle": {"type": str, "callback": _cycles},
     "cycles": {"type": str, "callback": _range},
     "fix": {"type": str, "multiple": True, "callback": _fixes},
     "vary": {"type": str, "multiple": True},
@@ -156,26 +171,33 @@ class Output:
 
     def finish(
         self,
-        save: Callable[..., object],
+        found: Result,
         page: Path,
-        content: Callable[[], Any],
-        text: Callable[[], str],
-        **options: Any,
-    ) -> None:
-        """Save a result in the folder of `page`, and print it and its place.
+        *,
+        check: Callable[[Path], object] = lambda _: None,
+        verbose: bool = False,
+        mapped: Mapped = map,
+    ) -> int:
+        """Save a result in the folder of `page`, print it and its place; return the exit code.
 
-        If saving fails, the result is printed all the same.
+        If saving fails, the result is printed all the same. `check` may refuse a folder.
         """
         from foamfit.report.folder import save_somewhere
 
-        options |= {"report": not self.no_report, "figure_width": self.figure_width}
+        def save(place: Path, **how: Any) -> None:
+            check(place)  # another fit may have written there in the meantime
+            found.save(place, figure_width=self.figure_width, mapped=mapped, **how)
+
         try:
             with progress_line(self.silent, "result") as line, without_ctrl_c():
                 line.progress(1.0, "writing the report")
-                save_somewhere(save, page.parent, **options)
+                save_somewhere(save, page.parent, report=not self.no_report)
         finally:
-            self.show(content, text)
+            self.show(found.printed, functools.partial(found.text, verbose=verbose))
         self.tell_written(page)
+        if found.failed:
+            say(f"foamfit: no acceptable fit was found; see {page.parent}", err=True)
+        return NOT_ACCEPTABLE if found.failed else 0
 
     def show(self, content: Callable[[], Any], text: Callable[[], str]) -> None:
         """Print a result as JSON or as text, whichever is asked for."""
@@ -241,14 +263,8 @@ def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -
         figure_format(plot)
 
 
-@contextmanager
-def compiling(
-    quiet: bool, model: str = "bistable", relaxation: int = 0
-) -> Iterator[Callable[[], None]]:
-    """Compile at first use, in parallel to the body.
-
-    The body calls the function that it receives before it simulates.
-    """
+def compile_solver(quiet: bool, model: str = "bistable") -> None:
+    """Compile at first use what the fit of a model needs, and say so unless `quiet`."""
     from foamfit.solve import cache, precompile
 
     if quiet:  # the log would announce later compilations
@@ -258,34 +274,30 @@ def compiling(
         if not quiet:
             say(f"foamfit: {cache.compiling('the solver')}", err=True)
 
-    with precompile.at_first_use(model, relaxation, tell) as finish:
-        yield finish
+    precompile.compile_solver(model, tell)
 
 
-class Drawers:
-    """Two processes that draw figures; with a single core this process draws them."""
+@contextmanager
+def drawing(wanted: bool) -> Iterator[Mapped]:
+    """Yield a `map` that draws figures in two processes, at once, or here with a single core."""
+    from foamfit.study import processes
 
-    _pool: Processes | None = None
+    pool = None
+    if wanted and processes.cores() > 1:
+        with suppress(OSError):  # the system allows no more processes
+            pool = processes.Processes(2, processes.DRAWING)
+    if pool is None:
+        yield map
+        return
 
-    def begin(self) -> None:
-        """Start the processes."""
-        from foamfit.study import processes
-
-        if processes.cores() > 1:
-            with suppress(OSError):  # the system allows no more processes
-                self._pool = processes.Processes(2, processes.DRAWING)
-
-    def map(self, draw: Callable[[str], Any], names: Iterable[str]) -> Iterable[Any]:
-        """Start drawing all figures; iterating over the results waits for each."""
-        if self._pool is None:
-            return map(draw, names)
-        begun = [(name, self._pool.submit(draw, name)) for name in names]
+    def start(draw: Callable[[str], Any], names: Iterable[str]) -> Iterable[Any]:
+        begun = [(name, pool.submit(draw, name)) for name in names]
         return (_drawn(one, draw, name) for name, one in begun)
 
-    def close(self) -> None:
-        """End the processes."""
-        if self._pool is not None:
-            self._pool.stop()
+    try:
+        yield start
+    finally:
+        pool.stop()
 
 
 def _drawn(begun: Future[Any], draw: Callable[[str], Any], name: str) -> Any:

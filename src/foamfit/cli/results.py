@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +90,11 @@ def published() -> None:
 @options.TEST
 @options.SPECIMEN
 @options.declared(
-    "cycle", help="Cycle of a slow record. Default: the first.", type=options.COUNT, metavar="N"
+    "cycle",
+    help="Cycle of a slow record. Default: the first.",
+    type=options.COUNT,
+    metavar="N",
+    callback=None,
 )
 @options.CYCLES
 @options.declared("drive", help="Default: the drive of the result.")
@@ -133,7 +136,6 @@ def predict(
     from foamfit.data.csv_file import read_test
     from foamfit.data.toml_file import toml_beside
     from foamfit.report.folder import check_target
-    from foamfit.report.studies.prediction import prediction_text
     from foamfit.study.identified import read_source
 
     toml = toml_beside(test)
@@ -141,14 +143,12 @@ def predict(
     check_target(output.out or default, of="prediction.json")
     folder = output.folder(default, (test, specimen or toml, result))
     read_source(result)  # report a wrong path before anything is compiled
-    with options.compiling(output.silent) as compile_rest:
-        measurement = read_test(test, specimen, cycle, cycles=cycles)
-        from foamfit.study import predict as study
+    measurement = read_test(test, specimen, cycle, cycles=cycles)
+    from foamfit.study import predict as study
 
-        compile_rest()
-        found = study.predict(result, measurement, **asked)
-        page, text = folder / "prediction.png", partial(prediction_text, found)
-        output.finish(found.save, page, found.to_json_dict, text)
+    options.compile_solver(output.silent)
+    found = study.predict(result, measurement, **asked)
+    output.finish(found, folder / "prediction.png")
 
 
 @main.command()
@@ -185,16 +185,13 @@ def plan(
     default = own if name.is_dir() else results[0].replace("/", "-")
     given = [path for path in map(Path, results) if path.exists()]
     folder = output.folder(Path("plans", default), [*given, *([rig] if rig else [])])
-    with options.compiling(output.silent) as compile_rest:
-        from foamfit.report.studies.plan import plan_text
-        from foamfit.study import plan as study
+    from foamfit.study import plan as study
 
-        compile_rest()
-        with progress_line(output.silent, "plan") as line:
-            found = study.plan(*results, rig=rig, quantity=quantity, seed=seed,
-                               progress=line.progress)  # fmt: skip
-        page, text = folder / "plan.html", partial(plan_text, found)
-        output.finish(found.save, page, found.to_json_dict, text)
+    options.compile_solver(output.silent)
+    with progress_line(output.silent, "plan") as line:
+        found = study.plan(*results, rig=rig, quantity=quantity, seed=seed,
+                           progress=line.progress)  # fmt: skip
+    output.finish(found, folder / "plan.html")
 
 
 @main.command()
@@ -245,9 +242,8 @@ def card(result: Path, format: str, units: str, rates: str | None, out: Path | N
         raise InputError(
             f"{file} lies in a result folder, which may be replaced; choose another --out"
         )
-    with options.compiling(False, source.model.name, source.model.relaxation) as compile_rest:
-        compile_rest()
-        made = cards.card(result, format=format, units=units, rates=asked)
+    options.compile_solver(False, source.model.name)
+    made = cards.card(result, format=format, units=units, rates=asked)
     if out is None:
         file.parent.mkdir(exist_ok=True)
     made.save(file)

@@ -125,9 +125,8 @@ def simulate(
     target = Path(scene.with_suffix(".csv").name) if out is None else out
     options.check_files(target, plot, files_of_scene(scene))
     check_target(target)
-    with options.compiling(quiet=False) as compile_rest:
-        chain, drive, time = read_scene(scene)
-        compile_rest()
+    chain, drive, time = read_scene(scene)
+    options.compile_solver(quiet=False)
     response = run(chain, drive, time, rtol)
     write_response(response, target)
     say(f"{response.solver}, {response.time.size} samples, written to {target}")

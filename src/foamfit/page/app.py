@@ -19,12 +19,32 @@ import panel as pn
 
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
-from foamfit.page import preview as previews
 from foamfit.page.curves import Curves, misfits_text
-from foamfit.page.desk import BUSY, LARGEST, QUANTITIES, Desk, wrong_quantity
-from foamfit.page.inputs import OF_CURVES, Inputs, models
+from foamfit.page.desk import (
+    BUSY,
+    LARGEST,
+    QUANTITIES,
+    Desk,
+    Preview,
+    preview,
+    remedies,
+    wrong_quantity,
+)
+from foamfit.page.inputs import (
+    OF_CURVES,
+    STYLE,
+    TEMPLATES,
+    WIDE,
+    Inputs,
+    button,
+    grid,
+    models,
+    piece,
+    soft,
+    text,
+    wrong,
+)
 from foamfit.page.turning import Turning
-from foamfit.page.widgets import STYLE, TEMPLATES, WIDE, button, grid, piece, soft, text, wrong
 from foamfit.page.worker import FirstUse, News, parsed
 from foamfit.parts import law_in_words
 from foamfit.report.folder import load_result
@@ -244,7 +264,7 @@ class Window:
         self._offer(str(error))
         if error and (csv := self.desk.csv) is not None:
             rest = self.inputs.rest.value or ""
-            self._beside(READING, lambda: previews.preview(csv, rest), self._show_preview)
+            self._beside(READING, lambda: preview(csv, rest), self._show_preview)
         unread = "The test cannot be read yet; see the error message."
         self.understood.object = soft(unread) if error else piece("verbatim", found)
         if self.desk.measurement is not None:
@@ -254,14 +274,13 @@ class Window:
     def _offer(self, message: str) -> None:
         """Show what a message proposes as buttons."""
         self.remedies[:] = [
-            button(words, partial(self._use, *one))
-            for words, one in previews.remedies(message).items()
+            button(words, partial(self._use, *one)) for words, one in remedies(message).items()
         ]
 
     def _use(self, channel: str, entry: Mapping[str, Any], event: Any) -> None:
         self.inputs.add_column(channel, entry)
 
-    def _show_preview(self, found: previews.Preview | Exception) -> None:
+    def _show_preview(self, found: Preview | Exception) -> None:
         """Show the curves of a file whose specimen is not known yet, and its columns."""
         if isinstance(found, Exception):
             return

@@ -16,8 +16,8 @@ from bokeh.models import Band, ColumnDataSource, LabelSet, Range1d
 from bokeh.plotting import figure
 
 from foamfit.arrays import Array
+from foamfit.page.inputs import WIDE, Sliders, grid, message, piece
 from foamfit.page.turning import PANELS, Drawn, Row, Turning
-from foamfit.page.widgets import WIDE, Sliders, grid, message, piece
 from foamfit.report.figures import GREY, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES

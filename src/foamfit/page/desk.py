@@ -1,4 +1,4 @@
-"""The files, the test and the fit of one window.
+"""The files, the test and the fit of one window, and what it shows of a file without a specimen.
 
 Each window has its own folder, which is removed with it. Windows share nothing.
 """
@@ -18,17 +18,20 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import tomli_w
 
-from foamfit.cli.fit import cycles_of
 from foamfit.data.csv_file import read_test
 from foamfit.data.energy import audit, describe
 from foamfit.data.measurement import Measurement
+from foamfit.data.tables.columns import Source
+from foamfit.data.tables.csv_table import read_text
 from foamfit.data.toml_file import toml_beside
 from foamfit.errors import InputError
 from foamfit.page.worker import Job, Worker, parsed
+from foamfit.report import figures
+from foamfit.report.panels import Line, Panel, draw
 from foamfit.springs import laws
 from foamfit.system import end_all
 from foamfit.text import listed
@@ -147,7 +150,7 @@ class Desk:
         try:
             toml.write_text(join_toml(quantities, rest), encoding="utf-8")
             asked = parsed([*arguments])
-            wanted = cycles_of(asked)
+            wanted = asked["cycle"]
             first = next(iter(wanted), None) if isinstance(wanted, tuple) else wanted
             measurement = read_test(self.csv, toml, first, cycles=asked["cycles"])
             # The folder of the window means nothing to a user.
@@ -293,12 +296,17 @@ def split_toml(text: str) -> tuple[dict[str, str], str]:
     return found, tomli_w.dumps(document)
 
 
-def join_toml(quantities: Mapping[str, str], rest: str) -> str:
-    """Merge the quantities filled in with the rest of the TOML; InputError if it is invalid."""
+def _document(rest: str) -> dict[str, Any]:
+    """Return the content of the further TOML; InputError if it is invalid."""
     try:
-        document = tomllib.loads(rest)
+        return tomllib.loads(rest)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(f"The further TOML is not valid TOML: {error}.") from None
+
+
+def join_toml(quantities: Mapping[str, str], rest: str) -> str:
+    """Merge the quantities filled in with the rest of the TOML; InputError if it is invalid."""
+    document = _document(rest)
     for name in QUANTITIES:
         if value := quantities.get(name, "").strip():
             table, key = name[1:].split("] ")
@@ -309,3 +317,81 @@ def join_toml(quantities: Mapping[str, str], rest: str) -> str:
                 raise InputError(f"The further TOML: {name} is also filled in above; give it once.")
             section[key] = value
     return tomli_w.dumps(document)
+
+
+# Choices of unit for each channel that the page offers.
+UNITS = {
+    "time": ("s", "ms", "us"),
+    "force": ("N", "kN", "mN"),
+    "stress": ("MPa", "kPa", "Pa"),
+    "displacement": ("mm", "um", "m"),
+    "strain": ("%", ""),
+}
+# Any specimen: with 1 m² and 1 m, stress is force and strain displacement.
+UNIT = {"specimen": {"height": "1 m", "area": "1 m^2"}}
+ENTRY = re.compile(r"\b(\w+) = \{ ?(column = [^{}…]+?) ?\}")
+
+
+class Preview(NamedTuple):
+    """Headers of a file, and its curves as a PNG, or why they cannot be read."""
+
+    headers: tuple[str, ...] = ()
+    picture: bytes | None = None
+    why: str = ""
+
+
+def preview(csv: Path, rest: str) -> Preview:
+    """Return what can be shown of a file with the TOML of its columns, `rest`."""
+    try:
+        source = Source.of(read_text(csv, "a table"), {}, {})
+        headers = tuple(header.text for header in source.table.headers if header.text)
+    except InputError:
+        return Preview()
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            toml = Path(folder, "test.toml")
+            toml.write_text(tomli_w.dumps(_document(rest) | UNIT), encoding="utf-8")
+            return Preview(headers, _picture(csv, toml, "strain" in source.columns))
+    except InputError as error:
+        return Preview(headers, None, str(error))
+
+
+def _picture(csv: Path, toml: Path, strained: bool) -> bytes:
+    """Draw force over time and over the motion."""
+    test, panels = read_test(csv, toml), list[Panel]()
+    if test.stress is None:
+        raise InputError("there is no force to draw")
+    motion = ("strain", "–") if strained else ("displacement", "m")
+    for x, name, unit in ((test.time, "time", "s"), (test.displacement, *motion)):
+        if x is not None:
+            style = {"color": figures.BLUE, "lw": 0.9}
+            panels.append(Panel(name, name, unit, "force", "N", [Line(x, test.stress, "", style)]))
+    with figures.drawing(7.0, 2.6) as figure:
+        axes = figures.grid_of(figure, 1, max(len(panels), 1), len(panels))
+        for ax, panel in zip(axes, panels, strict=True):
+            draw(ax, panel)
+    return figures.image(figure, "png", 130)
+
+
+def remedies(message: str) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Return the entries of [columns] that a message proposes, by the words of their buttons."""
+    found = [
+        (channel, tomllib.loads(f"entry = {{ {content} }}")["entry"])
+        for channel, content in ENTRY.findall(message)
+    ]
+    units = (f" in {entry['unit']}" if "unit" in entry else "" for _, entry in found)
+    return {
+        f"Use {one[1]['column']}{unit} as {one[0]}": one
+        for one, unit in zip(found, units, strict=True)
+    }
+
+
+def with_column(rest: str, channel: str, entry: Mapping[str, Any]) -> str:
+    """Return the TOML `rest` with an entry of [columns]; InputError if `rest` is invalid.
+
+    `entry` is like {"column": "Load", "unit": "kN"}; an empty one is removed.
+    """
+    document = _document(rest)
+    document["columns"] = document.get("columns", {}) | {channel: dict(entry)}
+    document["columns"] = {name: one for name, one in document["columns"].items() if one}
+    return tomli_w.dumps({name: one for name, one in document.items() if one != {}})

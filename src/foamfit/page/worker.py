@@ -34,12 +34,11 @@ if TYPE_CHECKING:
 
 PACKAGE = Path(__file__).parent.parent
 COMPILING = "compiling the solver, once after installation"
-# Compiled in this order, for springs without and with memory: model, number of relaxation terms,
-# and the function that is cached last.
-COMPILED = (("bistable", 0, "integrate"), ("microscale", 1, "follow"))
-COMPILE = """from foamfit.solve.precompile import at_first_use
-with at_first_use({!r}, {}, lambda: None) as compile_rest:
-    compile_rest()"""
+# Compiled in this order, for springs without and with memory: model, and the function that is
+# cached last.
+COMPILED = (("bistable", "integrate"), ("microscale", "follow"))
+COMPILE = """from foamfit.solve.precompile import compile_solver
+compile_solver({!r}, lambda: None)"""
 STOP = "stop"
 STOPPED_EARLY = "The fit was stopped before it had a result; start it again."
 
@@ -162,10 +161,10 @@ class FirstUse:
         )
         return self.parts[-1 if memory else 0]
 
-    def _compile(self, model: str, relaxation: int, loop: str) -> None:
+    def _compile(self, model: str, loop: str) -> None:
         if self._closed or cache.compiled(loop):
             return
-        command = [sys.executable, "-c", COMPILE.format(model, relaxation)]
+        command = [sys.executable, "-c", COMPILE.format(model)]
         self._process = subprocess.Popen(command, env=with_package(), **apart())
         self._process.wait()
 
@@ -242,23 +241,20 @@ def _run(job: Job) -> tuple[str, str]:
     """Fit and write the result; return why the fit failed or "", and the text on cycles."""
     try:
         from foamfit.cli.fit import read_as_asked
-        from foamfit.report.studies.cycles import cycles_text
-        from foamfit.results import Fit
-        from foamfit.solve.precompile import at_first_use
+        from foamfit.solve.precompile import compile_solver
         from foamfit.terminal import without_ctrl_c
 
         teller, asked = _Teller(), parsed(job.arguments)
         width = asked.pop("figure_width")
         tell = partial(teller.progress, 0.0, COMPILING, now=True)
-        with at_first_use(asked["model"], asked["relaxation"], tell) as compile_rest:
-            ready = read_as_asked(Path(job.csv), Path(job.toml), asked)
-            compile_rest()
-            with as_signalled():
-                found = ready.fit(teller)
+        ready = read_as_asked(Path(job.csv), Path(job.toml), asked)
+        compile_solver(asked["model"], tell)
+        with as_signalled():
+            found = ready.fit(teller)
         with without_ctrl_c():
             teller.progress(1.0, "writing the report", now=True)
             found.save(job.folder, figure_width=width)
-            told = "" if isinstance(found, Fit) else cycles_text(found)
+            told = "" if ready.several is None else found.text()
     except (InputError, SimulationError) as error:
         return str(error), ""
     except KeyboardInterrupt:

@@ -2,5 +2,6 @@
 
 `render` fills the sentences in `templates`. `summary` makes the report; `plots` draws the fit,
 `result_figures` the other figures of the report, and `figures` contains their common layout and
-style. `comparison` compares results with published ones; `studies` covers several tests.
+style. `shown` has what all results have in common, `listing` the tables of fits; `comparison`
+compares results with published ones; `studies` covers several tests.
 """

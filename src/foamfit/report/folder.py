@@ -10,7 +10,9 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.codec import plain
@@ -18,17 +20,21 @@ from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, reason, replacing
 from foamfit.report.figures import TWO
 from foamfit.report.result_figures import Mapped, draw_all
-from foamfit.report.samples import FILE as SAMPLES
-from foamfit.report.samples import write_samples
 from foamfit.report.summary import render_report
 from foamfit.report.tables import numbers_of, parameters_tex, with_head
 from foamfit.results import SCHEMA, Fit
+from foamfit.springs.parameters import unit_of
 
+if TYPE_CHECKING:
+    import xarray
+
+
+SAMPLES = "samples.nc"
 # Files of each kind of result, by the file that identifies it. They include files that only older
 # versions wrote, so that older folders can be replaced.
 _OLDER = {"fit.csv", "residuals.csv", "sensitivities.csv", "residuals.pdf", "information.pdf"}
-_OLDER |= {"snapping.pdf", "profiles.pdf"}
-_TABLES = {"fit.json", "parameters.csv", "curves.csv", "profiles.csv", "ladder.csv", "budget.csv"}
+_OLDER |= {"snapping.pdf", "profiles.pdf", "ladder.csv"}
+_TABLES = {"fit.json", "parameters.csv", "curves.csv", "profiles.csv", "budget.csv"}
 _DRAWN = {"fit.png", "fit.pdf", "report.html"}
 _KINDS = ("json", "csv", "html", "tex", "png", "pdf")
 FILES = {
@@ -237,8 +243,8 @@ def write_result(
 ) -> None:
     """Write all files of a result into an existing folder; report and figures only with `pages`.
 
-    ``profiles.csv`` and ``ladder.csv`` are written if there are profiles and a ladder,
-    ``budget.csv`` if the budget contains more than the parameters. For `width` and `mapped` see
+    ``profiles.csv`` is written if there are profiles, ``budget.csv`` if the budget contains more
+    than the parameters. For `width` and `mapped` see
     `foamfit.report.result_figures.draw_all`.
     """
     figures = draw_all(result, width, mapped) if pages else ()  # other processes start to draw now
@@ -258,8 +264,6 @@ def write_result(
         write_samples(folder / SAMPLES, result.draws)
     if pages and result.budget is not None and result.budget.telling:
         write_table(folder / "budget.csv", result.budget.rows())
-    if result.ladder is not None:
-        write_table(folder / "ladder.csv", result.ladder.rows())
     for name, images in (drawn := dict(figures)).items():
         for kind in ("png", "pdf"):
             if content := getattr(images, kind, b""):
@@ -295,3 +299,53 @@ def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
     # As Python floats, because NumPy floats would be written with the name of their type.
     samples = zip(*(column.tolist() for column in columns.values()), strict=True)
     path.write_bytes(csv_bytes([columns, *samples]))
+
+
+_DIMS = ("chain", "draw")
+
+
+def write_samples(path: Path, draws: Mapping[str, Array]) -> None:
+    """Write samples (chain, draw) of parameters in SI; `xarray.open_dataset` reads the file."""
+    from scipy.io import netcdf_file
+
+    with netcdf_file(path, "w", version=2) as file:
+        for dim, size in zip(_DIMS, next(iter(draws.values())).shape, strict=True):
+            file.createDimension(dim, size)
+            file.createVariable(dim, "i4", (dim,))[:] = np.arange(size)
+        for name, values in draws.items():
+            variable: Any = file.createVariable(name, "f8", _DIMS)
+            variable[:] = values
+            variable.units = unit_of(name) or "1"
+
+
+def read_samples(path: Path) -> dict[str, Array]:
+    """Read a file of `write_samples`; return an empty dict if the file does not exist."""
+    from scipy.io import netcdf_file
+
+    if not path.is_file():
+        return {}
+    try:
+        with netcdf_file(path, "r", mmap=False) as file:
+            found = file.variables.items()
+            return {name: np.array(v[:], dtype=float) for name, v in found if name not in _DIMS}
+    except (OSError, ValueError, TypeError, IndexError) as error:
+        raise InputError(f"{path} is damaged: {error}") from None
+
+
+def dataset(draws: Mapping[str, Array], **about: str) -> xarray.Dataset:
+    """Return samples in the form that ArviZ reads: dimensions chain and draw, attributes `units`.
+
+    Raises
+    ------
+    InputError
+        If xarray is not installed.
+    """
+    try:
+        import xarray
+    except ImportError:
+        raise InputError(
+            'samples need xarray, which is not installed; pip install "foamfit[mcmc]"'
+        ) from None
+    columns = {n: (_DIMS, values, {"units": unit_of(n) or "1"}) for n, values in draws.items()}
+    sizes = zip(_DIMS, next(iter(draws.values())).shape, strict=True)
+    return xarray.Dataset(columns, {dim: np.arange(size) for dim, size in sizes}, about)

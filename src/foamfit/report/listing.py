@@ -1,28 +1,46 @@
-"""The table of fits of `list`, `batch` and `joint`: a page, and a line each in the terminal."""
+"""Tables of fits of `list`, `batch` and `joint`: a page, a CSV, and lines in the terminal."""
 
 from __future__ import annotations
 
+import csv
+import re
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.codec import build
+from foamfit.codec import build, plain
 from foamfit.errors import InputError
-from foamfit.files import write_file
+from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.parts import ParameterEstimate, law_in_words
-from foamfit.report.figures import tail
+from foamfit.report.figures import tail, write_both
 from foamfit.report.folder import load_result
-from foamfit.report.render import page
-from foamfit.report.tables import MISFITS, by_test, varied
+from foamfit.report.render import page, words
+from foamfit.report.studies.parameters import panels_of, plot_parameters
+from foamfit.report.summary import CURVES
+from foamfit.report.tables import (
+    MISFITS,
+    by_test,
+    by_test_tex,
+    count_determined,
+    unit_of_all,
+    varied,
+    wide,
+    with_head,
+)
+from foamfit.results import Fit
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import counted, percent
+from foamfit.text import counted, listed, percent
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 PAGE, MARK = "index.html", b'<meta name="generator" content="foamfit list">'
 LONGEST = 36  # characters of the name of a test in the terminal
@@ -34,28 +52,42 @@ FITTED = "stress along measured displacement (Pa)"
 
 
 @dataclass(frozen=True)
-class Listed:
-    """One result: its place within the folder, and what the table shows of it."""
+class Row:
+    """A line of a table of fits: a result, or a test of a batch or a joint fit.
 
-    place: Path
+    Without a result, `error` says why. `misfit` has the names of fit.json.
+    """
+
     test: str
-    status: str
-    misfits: Mapping[str, float | None]  #: by the names in fit.json
-    error: str = ""  #: why there is no result
+    file: str = ""
+    status: str = ""
+    error: str | None = None
+    misfit: Mapping[str, float | None] = field(default_factory=dict)
+    runtime_s: float | None = None
+    parameters: Mapping[str, ParameterEstimate] = field(default_factory=dict)
     model: str = ""
     options: str = ""
-    determined: int = 0
-    varied: int = 0
-    when: float | None = None  #: s since the epoch
-    parameters: Mapping[str, ParameterEstimate] = field(default_factory=dict)
     more: Mapping[str, tuple[str, str]] = field(default_factory=dict)  #: other cells, with notes
-    curves: tuple[str, ...] = ()  #: points of the measured and the fitted loop, of an SVG polyline
+    place: Path = Path()  #: its folder
+    when: float | None = field(default=None, metadata={"omitted": True})  #: s since the epoch
+
+    @property
+    def has_fit(self) -> bool:
+        """Whether there is an acceptable fit."""
+        return self.status in ("ok", "warnings")
 
     @property
     def report(self) -> str:
         """The name of its report; "" if none was written."""
-        names = ("report.html", "joint.html")
-        return next((name for name in names if (self.place / name).is_file()), "")
+        found = [
+            n for n in ("report.html", "joint.html") if self.place and (self.place / n).is_file()
+        ]
+        return found[0] if found else ""
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """How many parameters of the springs are determined, and how many are varied."""
+        return count_determined(self.parameters)
 
     @property
     def date(self) -> str:
@@ -63,17 +95,18 @@ class Listed:
         return time.strftime("%Y-%m-%d %H:%M", time.localtime(self.when))
 
     @property
-    def row(self) -> list[str]:
-        """The cells of the line in the terminal; of the misfits the largest."""
-        known = [misfit for misfit in self.misfits.values() if misfit is not None]
-        cells = [percent(max(known)) if known else "–", f"{self.determined} of {self.varied}"]
+    def cells(self) -> list[str]:
+        """The line in the terminal; of the misfits the largest."""
+        known = [misfit for misfit in self.misfit.values() if misfit is not None]
+        found, varied = self.counts
+        cells = [percent(max(known)) if known else "–", f"{found} of {varied}"]
         rest = [self.error, "", ""] if self.error else [self.options, *cells]
         return [tail(self.test, LONGEST), self.model, self.status, *rest, self.date]
 
 
-def lines(results: Sequence[Listed]) -> str:
+def lines(results: Sequence[Row]) -> str:
     """Return a line for each result, below a head."""
-    rows = [HEAD, *(one.row for one in results)]
+    rows = [HEAD, *(one.cells for one in results)]
     wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(row, wide, strict=True)).rstrip()
@@ -81,7 +114,7 @@ def lines(results: Sequence[Listed]) -> str:
     )
 
 
-def results_in(folder: str | Path) -> list[Listed]:
+def results_in(folder: str | Path) -> list[Row]:
     """Return the results of fits and joint fits in a folder and below, by place.
 
     Raises InputError if the folder contains no result.
@@ -99,7 +132,7 @@ def results_in(folder: str | Path) -> list[Listed]:
     return [_listed(path) for path in kept]
 
 
-def _listed(path: Path) -> Listed:
+def _listed(path: Path) -> Row:
     """Return one result; a damaged one says why."""
     when, place = path.stat().st_mtime, path.parent
     try:
@@ -109,27 +142,22 @@ def _listed(path: Path) -> Listed:
         rest = {
             k: v for k, v in given.items() if k not in ("model", "relaxation") and v is not None
         }
-        every = {name: one for name, one in content["parameters"].items() if name not in NUISANCE}
-        known = [p for p in every.values() if p.get("vary", p.get("kind") != "fixed")]
-        estimates = dict[str, ParameterEstimate]()
-        with suppress(KeyError, TypeError, ValueError):  # of a joint fit, or of an older version
-            estimates = {name: build(ParameterEstimate, p, {}) for name, p in every.items()}
-        return Listed(
-            place,
+        every = content["parameters"].items()
+        made = {n: {"vary": p.get("kind") != "fixed", **p} for n, p in every if n not in NUISANCE}
+        return Row(
             str(content.get("test") or content.get("name")),
-            content["status"],
-            content.get("misfit") or _largest(content.get("tests", {})),
+            status=content["status"],
+            misfit=content.get("misfit") or _largest(content.get("tests", {})),
+            runtime_s=content.get("runtime_s"),
+            parameters={name: build(ParameterEstimate, p, {}) for name, p in made.items()},
             model=law_in_words(model.name, content.get("relaxation", 0)),
             options=", ".join(k if v is True else f"{k} {v}" for k, v in rest.items()),
-            determined=sum(one.get("state") == "determined" for one in known),
-            varied=len(known),
+            place=place,
             when=when,
-            parameters=estimates,
-            curves=small_loop(place / "curves.csv"),
         )
     except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
         why = str(error) if isinstance(error, InputError) else f"{path.name} is damaged"
-        return Listed(place, place.name, "failed", {}, why, when=when)
+        return Row(place.name, status="failed", error=why, place=place, when=when)
 
 
 def _largest(tests: dict[str, Any]) -> dict[str, float]:
@@ -163,41 +191,43 @@ def small_loop(path: Path) -> tuple[str, ...]:
     return tuple(map(points, values[:, 1:].T))
 
 
-def table_of(results: Sequence[Listed], top: Path, *, loops: bool = True) -> dict[str, Any]:
-    """Return the values of table.html; with small loops, each with a box to tick.
+def table_of(results: Sequence[Row], top: Path) -> dict[str, Any]:
+    """Return the values of table.html for results in the folder `top`.
 
-    Parameters are shown if all fits have the same model.
+    The place of a result that has none is the name of its test. Parameters are shown if all fits
+    have the same model.
     """
+    results = [
+        replace(one, place=one.place if one.place.name else top / one.test) for one in results
+    ]
     alike = len({one.model for one in results if not one.error}) <= 1
     parameters = varied([one.parameters for one in results if alike])
     found = by_test([one.place.relative_to(top).as_posix() for one in results], parameters)
-    misfits = {name for one in results for name, x in one.misfits.items() if x is not None}
+    loops = [small_loop(one.place / "curves.csv") for one in results]
+    misfits = {name for one in results for name, x in one.misfit.items() if x is not None}
     return {
-        "rows": [
-            (one, at, cells) for one, (at, *cells) in zip(results, found["rows"], strict=True)
-        ],
+        "rows": list(zip(results, loops, ((at, p) for at, *p in found["rows"]), strict=True)),
         "heads": found["heads"],
         "misfits": {curve: name for curve, name in MISFITS.items() if curve in misfits},
         "more": list(dict.fromkeys(name for one in results for name in one.more)),
-        "loops": loops,
         "models": not alike,
         "options": any(one.options for one in results),
         "states": any(one.status for one in results),
-        "counted": any(one.varied for one in results),
+        "counted": any(one.status and one.counts[1] for one in results),
+        "timed": any(one.runtime_s is not None for one in results),
         "dated": any(one.when is not None for one in results),
         "size": (WIDE, TALL),
     }
 
 
-def index_page(results: Sequence[Listed], top: Path, title: str, counts: str, **more: Any) -> bytes:
+def index_page(results: Sequence[Row], top: Path, title: str, counts: str, **more: Any) -> bytes:
     """Return the page of a table of fits; `more` may have a picture, a CSV and `left_out`."""
     given = {"picture": None, "csv": "", "left_out": False, "mark": MARK.decode()} | more
-    table = table_of(results, top)
-    text = page("index", folder=str(top), title=title, counts=counts, table=table, **given)
+    text = page("index", title=title, counts=counts, table=table_of(results, top), **given)
     return text.encode("utf-8", errors="replace")
 
 
-def write_index(folder: str | Path, results: Sequence[Listed]) -> Path | None:
+def write_index(folder: str | Path, results: Sequence[Row]) -> Path | None:
     """Write FOLDER/index.html, with links to the reports, and return its path.
 
     None if the folder is a result itself. Raises InputError rather than replace another page.
@@ -212,3 +242,124 @@ def write_index(folder: str | Path, results: Sequence[Listed]) -> Path | None:
     law = f" · {laws.pop()}" if len(laws) == 1 else ""
     write_file(path, index_page(results, top, str(folder), counted(len(results), "result") + law))
     return path
+
+
+# Status of a test without a result.
+REFUSED, OPEN = "refused", "not fitted"
+_STATUS = {
+    "ok": "fitted",
+    "warnings": "fitted with warnings",
+    "failed": "without an acceptable fit",
+    REFUSED: "refused",
+    OPEN: "not fitted yet",
+}
+MOST_ON_PAGE = 5000
+_MOST_REFUSALS = 20  # named on the terminal
+
+
+def row_of(test: str, file: str, result: Fit) -> Row:
+    """Return the row of a fit."""
+    error = None
+    if result.status == "failed":
+        fatal = (check for check in result.checklist if check.fatal and check.answer is False)
+        reasons = [w for check in fatal for w in (check.warnings or (check.sentence,))]
+        error = " ".join(["no acceptable fit was found:", *(reasons or result.warnings)[:1]])
+    misfit, runtime = plain(result.misfit), plain(result.runtime_s)
+    return Row(test, file, result.status, error, misfit, runtime, result.parameters)
+
+
+# ------------------------------------------------------------------------------- the table
+
+
+def table_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return the rows of summary.csv in SI, one per test; None for missing values."""
+    return [
+        {name: getattr(row, name) for name in ("test", "file", "status", "error")}
+        | {f"misfit_{name}": row.misfit.get(name) for name in CURVES}
+        | {"runtime_s": row.runtime_s, **parameters}
+        for row, parameters in zip(rows, wide([row.parameters for row in rows]), strict=True)
+    ]
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Read a summary.csv; raise InputError if the file is not one."""
+    import pandas as pd
+
+    words = ("test", "file", "status", "error")
+    try:
+        cells = csv.reader(read_whole(path).decode().splitlines(True))
+        head, *rows = ([re.sub("^'(?=[=+@-])", "", one) or None for one in row] for row in cells)
+        numbers = [name for name in head if name not in words and not str(name).endswith("_state")]
+        table = pd.DataFrame([dict(zip(head, row, strict=True)) for row in rows])
+        return table.astype(dict.fromkeys(numbers, float))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} is not the summary of a batch: {error}") from None
+
+
+def write_summary(rows: Sequence[Row], folder: Path) -> None:
+    """Write summary.csv."""
+    write_file(folder / "summary.csv", csv_bytes(with_head(table_rows(rows))))
+
+
+def counts_in_words(rows: Sequence[Row]) -> str:
+    """Return the numbers of tests, of cycles and of each status in words."""
+    number = Counter(row.status for row in rows)
+    parts = [f"{number[status]} {label}" for status, label in _STATUS.items() if number[status]]
+    total = counted(len({row.test.partition("/")[0] for row in rows}), "test")
+    if cycles := sum("/" in row.test for row in rows):
+        total += f", {counted(cycles, 'cycle')}"
+    return f"{total}: {listed(parts)}" if parts else "no test"
+
+
+def summary_words(rows: Sequence[Row]) -> str:
+    """Return the text that the command prints for a batch.
+
+    Its table contains median and quartiles over the tests for each varied parameter.
+    """
+    wrong, parameters = [row for row in rows if not row.has_fit], list[Any]()
+    for name, each in varied([row.parameters for row in rows if row.has_fit]).items():
+        present = [p for p in each if p is not None]
+        factor, unit = unit_of_all(present)
+        quartiles = np.quantile([p.value / factor for p in present], [0.5, 0.25, 0.75])
+        parameters.append((name, quartiles, unit, [p.state for p in present]))
+    return words(
+        "batch",
+        counts=counts_in_words(rows),
+        wrong=wrong[:_MOST_REFUSALS],
+        more=max(len(wrong) - _MOST_REFUSALS, 0),
+        parameters=parameters,
+    )
+
+
+# ------------------------------------------------------------------------------- the page
+
+
+def write_comparison(
+    rows: Sequence[Row], folder: Path, title: str, *, width: str, pictures: bool
+) -> bytes | None:
+    """Write the parameters of all tests as summary.tex and, with `pictures`, as figures.
+
+    Return the figure as SVG, if there is one.
+    """
+    fitted = [row for row in rows if row.has_fit]
+    tests = [row.test for row in fitted]
+    every = varied([row.parameters for row in fitted])
+    found = {name: each for name, each in every.items() if name not in NUISANCE}
+    write_file(folder / "summary.tex", by_test_tex("Test", tests, found).encode("utf-8", "replace"))
+    if not (pictures and found):
+        return None
+    figure = plot_parameters(
+        f"{title} · {counts_in_words(rows)}", tests, panels_of(tests, found), width=width
+    )
+    return write_both(figure, folder / "summary")
+
+
+def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | None = None) -> None:
+    """Write summary.html, a self-contained page, with a figure (SVG)."""
+    shown = rows
+    if len(rows) > MOST_ON_PAGE:  # tests without a fit are always shown
+        first = {id(row) for row in rows[:MOST_ON_PAGE]}
+        shown = [row for row in rows if id(row) in first or not row.has_fit][: 2 * MOST_ON_PAGE]
+    more: Any = {"picture": picture, "csv": "summary.csv", "left_out": len(shown) < len(rows)}
+    text = index_page(shown, folder, title, counts_in_words(rows), **more)
+    write_file(folder / "summary.html", text)

@@ -1,20 +1,23 @@
-"""The panels of a fit: measured and fitted curves with their residuals."""
+"""The panels of a fit: measured and fitted curves, residuals, marks of switches and branches."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import product
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.report.figures import GREY, INSIDE, VERMILION
+from foamfit.report.figures import BLUE, GREY, INSIDE, VERMILION
 from foamfit.report.readable import readable_unit
 from foamfit.results import Fit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
 
 MARKERS = 60  # markers on a measured curve; more would merge
 MANY = 5000  # samples beyond which a curve is stored as pixels, because its outline is too large
@@ -26,7 +29,7 @@ MARKS = ("^", "v", "D", "p")
 
 @dataclass(frozen=True)
 class Line:
-    """A curve of a panel in SI; `residual` of a measured one is in % of its range."""
+    """A curve of a panel in SI, or with `high` a band between two curves."""
 
     x: Array
     y: Array
@@ -34,12 +37,15 @@ class Line:
     style: dict[str, Any]
     kind: Literal["measured", "fitted", "other"] = "other"
     node: int = 0  # interior mass, 0 = top
-    residual: Array | None = None
+    high: Array | None = None
 
 
 @dataclass(frozen=True)
 class Panel:
-    """Curves in common axes, with the names and SI units of the axes."""
+    """Curves in common axes, with the names and SI units of the axes.
+
+    `below` are curves in a strip below the panel, in % of the measured range: residuals or others.
+    """
 
     name: str  # "stress-strain", …
     x_name: str
@@ -47,6 +53,8 @@ class Panel:
     y_name: str
     y_unit: str
     lines: list[Line]
+    below: list[Line] = field(default_factory=list)
+    below_name: str = "residual"
 
     @property
     def is_loop(self) -> bool:
@@ -84,32 +92,37 @@ def panels_of(result: Fit) -> list[Panel]:
     def compared(curve: str, fitted: Array | None) -> Array | None:
         return None if result.misfit.get(curve) is None else fitted
 
-    fitted = compared("stress_time", c.stress)
-    pushing = _measured(c.time, c.measured_stress, fitted) + _fitted(c.time, c.stress)
-    fitted = compared("displacement_time", c.displacement)
-    moving = _measured(c.time, c.measured_displacement, fitted, motion)
+    pushing = measured(c.time, c.measured_stress) + _fitted(c.time, c.stress)
+    moving = measured(c.time, c.measured_displacement, motion)
     moving += _fitted(c.time, c.displacement)
-    for node, (measured, fitted) in c.interior.items():
-        moving += _measured(c.time, measured, fitted, node=node) + _fitted(c.time, fitted, node)
-    loop = _measured(strain, c.measured_stress, compared("stress_strain", c.stress_along), motion)
+    fitted = compared("displacement_time", c.displacement)
+    off = _residual(c.time, c.measured_displacement, fitted)
+    for node, (seen, fitted) in c.interior.items():
+        moving += measured(c.time, seen, node=node) + _fitted(c.time, fitted, node)
+        off += _residual(c.time, seen, fitted, node)
+    loop = measured(strain, c.measured_stress, motion)
+    along = compared("stress_strain", c.stress_along)
     loop += _fitted(None if moved is None else moved / height, pushed)
     if strain is not None and c.stress_along is not None and not is_known(result):
         # Wide and pale below the others, because it coincides with them if the fit is good.
         pale = {"color": PALE, "lw": 3.2, "zorder": 2}
         loop.append(Line(strain, c.stress_along, "springs along measured strain", pale))
+    pushed_off = _residual(c.time, c.measured_stress, compared("stress_time", c.stress))
+    looped_off = _residual(strain, c.measured_stress, along)
     panels = [
-        Panel("stress-time", "time", "s", "stress", "Pa", pushing),
-        Panel("displacement-time", "time", "s", "displacement", "m", moving),
-        Panel("stress-strain", "strain", "–", "stress", "Pa", loop),
+        Panel("stress-time", "time", "s", "stress", "Pa", pushing, pushed_off),
+        Panel("displacement-time", "time", "s", "displacement", "m", moving, off),
+        Panel("stress-strain", "strain", "–", "stress", "Pa", loop, looped_off),
     ]
     if is_known(result):
         panels = [panels[2], panels[0]]
     return [panel for panel in panels if panel.lines]
 
 
-def _measured(
-    x: Array | None, y: Array | None, fitted: Array | None, motion: str = "measured", node: int = 0
+def measured(
+    x: Array | None, y: Array | None, motion: str = "measured", node: int = 0
 ) -> list[Line]:
+    """Return a measured curve, or none if it is missing."""
     if x is None or y is None:
         return []
     label, mark, edge = "measured", "o", "0.6"
@@ -119,8 +132,15 @@ def _measured(
     elif motion != "measured":
         label, mark = f"measured, motion {motion}", "s"
     style = {"marker": mark, "mfc": "white", "mec": edge, "mew": 0.6, "ms": 3.4, "zorder": 3}
-    residual = None if fitted is None else 100.0 * (fitted - y) / (float(np.ptp(y)) or 1.0)
-    return [Line(x, y, label, style, "measured", node, residual)]
+    return [Line(x, y, label, style, "measured", node)]
+
+
+def _residual(x: Array | None, y: Array | None, fitted: Array | None, node: int = 0) -> list[Line]:
+    if x is None or y is None or fitted is None:
+        return []
+    style = {"color": _colour(node), "lw": 0.7}
+    off = 100.0 * (fitted - y) / (float(np.ptp(y)) or 1.0)
+    return [Line(x, off, "_fitted − measured", style)]
 
 
 def _fitted(x: Array | None, y: Array | None, node: int = 0) -> list[Line]:
@@ -140,6 +160,9 @@ def draw(ax: Axes, panel: Panel) -> None:
     fx, x_label, fy, y_label = panel.scale()
     for line in panel.lines:
         x, y, style = line.x / fx, line.y / fy, line.style
+        if line.high is not None:
+            ax.fill_between(x, y, line.high / fy, label=line.label, **style)
+            continue
         if line.kind == "measured":
             thin: Any = {"color": "0.82", "lw": 0.5, "zorder": 1, "rasterized": x.size > MANY}
             ax.plot(x, y, label=f"_{line.label.removeprefix('_')}, all samples", **thin)
@@ -150,16 +173,14 @@ def draw(ax: Axes, panel: Panel) -> None:
     ax.margins(0.05, 0.11)
 
 
-def draw_residuals(ax: Axes, strip: Axes, panel: Panel) -> None:
-    """Draw fitted minus measured below a panel, in percent of the measured range."""
-    for line in panel.lines:
-        if line.residual is not None:
-            style: Any = {"color": _colour(line.node), "lw": 0.7, "label": "_fitted − measured"}
-            style["rasterized"] = line.x.size > MANY
-            strip.plot(line.x / panel.scale()[0], line.residual, **style)
+def draw_below(ax: Axes, strip: Axes, panel: Panel) -> None:
+    """Draw the strip below a panel, such as fitted minus measured."""
+    for line in panel.below:
+        style = line.style | {"rasterized": line.x.size > MANY}
+        strip.plot(line.x / panel.scale()[0], line.y, label=line.label, **style)
     strip.axhline(0.0, color=GREY, lw=0.6, zorder=1)
-    strip.set(xlabel=ax.get_xlabel(), label=f"{panel.name}, residual")
-    strip.set_ylabel("residual\n(% of range)", fontsize=7)
+    strip.set(xlabel=ax.get_xlabel(), label=f"{panel.name}, {panel.below_name}")
+    strip.set_ylabel(f"{panel.below_name}\n(% of range)", fontsize=7)
     strip.sharex(ax)
     ax.set_xlabel("")
     ax.tick_params(labelbottom=False)
@@ -178,3 +199,209 @@ def evenly(x: Array, y: Array, n: int) -> NDArray[np.intp]:
 def size(values: Array) -> float:
     """Return the largest absolute value; 0 without a finite one."""
     return float(np.nanmax(np.abs(values), initial=0.0))
+
+
+# Points at which a spring changes between two branches, in either order.
+POINTS = {"ad": "A1", "da": "A1", "dc": "C1", "ce": "C2", "ec": "C2", "ea": "A2"}
+# Offsets of a name from its point, in typographic points: preferred ones first, then further away.
+SIDES = ((-5.0, 4.0), (5.0, -4.0), (5.0, 4.0), (-5.0, -4.0))
+FARTHER = (1.0, 2.5, 4.0)
+LIGHT = {"a": 0.9, "c": 0.5}  # place of the name along an elastic branch, over its length
+STOOD = "#F2DC6B"  # standstill of the gauge
+
+
+def annotate(ax: Axes, panel: Panel, result: Fit, size: tuple[float, float]) -> None:
+    """Add everything except the curves to a panel of about this size in points."""
+    _mark_outliers(ax, panel, result)
+    _shade_standstills(ax, panel, result)
+    labels = _Labels(ax, panel, size)
+    if panel.is_loop:
+        _draw_law(labels, result)
+    _mark_switches(labels, panel, result)
+    if panel.is_loop:
+        _name_branches(labels, panel, result)
+
+
+def _mark_outliers(ax: Axes, panel: Panel, result: Fit) -> None:
+    """Mark outliers, which are not fitted, with crosses; at the edge if beyond the panel."""
+    test = result.measurement
+    fx, _, fy, _ = panel.scale()
+    own = "displacement" if panel.name == "displacement-time" else "stress"
+    for channel, found in test.outliers.items():
+        x, motion = found.at, test.displacement
+        if not channel.startswith(own) or not x.size:
+            continue
+        if panel.is_loop and motion is not None:
+            time = np.arange(motion.size) if test.time is None else test.time
+            x = np.interp(x, time, motion) / test.specimen.height
+        elif panel.is_loop or test.time is None:
+            continue
+        low, high = ax.get_ylim()  # fixed, so that an outlier does not shrink the curves
+        style: Any = {"ms": 4.0, "mew": 1.0, "color": "black", "zorder": 6, "clip_on": False}
+        y = np.clip(found.values / fy, low, high)
+        ax.plot(x / fx, y, "x", label="outlier, not fitted", **style)
+        ax.set_ylim(low, high)
+
+
+def _shade_standstills(ax: Axes, panel: Panel, result: Fit) -> None:
+    """Shade standstills of the gauge: a span of time, or a part of the measured loop."""
+    test = result.measurement
+    fx, _, fy, _ = panel.scale()
+    style: Any = {"color": STOOD, "zorder": 0.5, "label": "gauge stands still, bridged"}
+    for start, end in test.standstills:
+        if not panel.is_loop:
+            ax.axvspan(start / fx, end / fx, lw=0.0, **style)
+            continue
+        for line in panel.lines:
+            instants = np.arange(line.x.size) if test.time is None else test.time
+            if line.kind == "measured":
+                at = (instants >= start) & (instants <= end)
+                ax.plot(line.x[at] / fx, line.y[at] / fy, lw=7.0, solid_capstyle="butt", **style)
+
+
+# ---------------------------------------------------------------------------- names in a panel
+
+
+class _Labels:
+    """Placement of names in a panel, away from other names, curves and marks."""
+
+    def __init__(self, ax: Axes, panel: Panel, size: tuple[float, float]) -> None:
+        """Initialise for a panel of about this size in typographic points."""
+        self.ax, (self.fx, _, self.fy, _) = ax, panel.scale()
+        self.corner, high = np.transpose([ax.get_xlim(), ax.get_ylim()])
+        self.size, self.scale = size, np.array(size) / (high - self.corner)  # points per unit
+        self.drawn = [np.empty((0, 2))]  # points that names should not cover
+        for line in panel.lines:
+            if line.kind == "fitted":
+                seen = evenly(line.x, line.y, 4 * MARKERS)
+                self.drawn.append(np.column_stack((line.x / self.fx, line.y / self.fy))[seen])
+        self.taken: list[Array] = []
+
+    def mark(self, name: str, places: Array) -> None:
+        """Draw dots, which names should not cover, at places (n, 2) in the units of the axes."""
+        self.ax.plot(*places.T, "o", ms=3.2, color="black", zorder=5, label=f"_{name}")
+        self.drawn += [places, places]
+
+    def write(
+        self, name: str, places: Sequence[Array], sides: Sequence[Any] = SIDES, **style: Any
+    ) -> None:
+        """Write a name near one of `places`, where it covers least; earlier ones are preferred."""
+        avoid = (np.concatenate(self.drawn) - self.corner) * self.scale
+        size, candidates = np.array([4.2 * len(name), 9.0]), []
+        for rank, (place, far, (dx, dy)) in enumerate(product(places, FARTHER, sides)):
+            dy, left = far * dy, dx - (size[0] if dx < 0 else 0.0)
+            low = (place - self.corner) * self.scale + (left, dy - 0.5 * size[1])
+            high = low + size
+            names = sum(bool(np.all((low < b[2:]) & (b[:2] < high))) for b in self.taken)
+            beyond = bool(np.any((low < 0.0) | (high > self.size)))
+            inside = int(np.all((avoid > low) & (avoid < high), axis=1).sum())
+            cost = 1000 * names + 100 * beyond + inside + 0.5 * rank
+            candidates.append((cost, place, (dx, dy), np.concatenate((low, high))))
+        _, at, offset, box = min(candidates, key=lambda one: one[0])
+        self.taken.append(box)
+        style |= {"ha": "left" if offset[0] > 0 else "right", "va": "center", "zorder": 6}
+        style |= {"bbox": {"fc": "white", "alpha": 0.75, "lw": 0.0, "pad": 0.5}}
+        style |= {"textcoords": "offset points", "annotation_clip": False}
+        self.ax.annotate(name, (float(at[0]), float(at[1])), offset, **style)
+
+
+def _mark_switches(labels: _Labels, panel: Panel, result: Fit) -> None:
+    """Mark the switches of the springs, and name each kind of switch once."""
+    at: dict[str, list[tuple[float, float]]] = {}
+    for spring, point, x, y in _points(panel, result):
+        name = f"{spring} {point}" if len(result.chain.springs) > 1 else point
+        at.setdefault(name, []).append((x / labels.fx, y / labels.fy))
+    for name, places in at.items():
+        labels.mark(name, np.array(places))
+    for name, places in at.items():
+        labels.write(name, [np.array(places[0])], fontsize=7)
+
+
+def _points(panel: Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
+    """Yield spring, name, x and y of changes of branch and of half-snapped micro-springs.
+
+    They are in the coordinates of the measured curves, whose zeros may have been fitted.
+    """
+    for switch in result.switches:
+        ends, x = (switch.source, switch.target), switch.time
+        name = POINTS.get("".join(ends))
+        moved = switch.displacement + result.zero_of("displacement")
+        if panel.is_loop:
+            x = moved / result.measurement.specimen.height
+        remembers = result.chain.springs[switch.spring - 1].law.remembers
+        if x is not None and not (name is None and remembers):
+            stress = switch.stress + result.zero_of("stress")
+            y = moved if panel.name == "displacement-time" else stress
+            yield f"s{switch.spring}", name or "→".join(ends), x, y
+    for spring, snapped in result.snapping.items():
+        for symbol, sample in zip(("σ₊", "σ₋"), snapped.halves, strict=True):
+            if sample is not None and (on := panel.fitted) is not None and sample < on.x.size:
+                yield spring, symbol, float(on.x[sample]), float(on.y[sample])
+
+
+def _draw_law(labels: _Labels, result: Fit) -> None:
+    """Draw the elastic branches, if any, and the equilibrium of a single spring."""
+    spring, ax = result.chain.springs[0], labels.ax
+    if len(result.chain.springs) > 1 or not hasattr(spring, "elastic_branches"):
+        return
+    (left, right), (low, top) = ax.get_xlim(), ax.get_ylim()
+    ax.set(xlim=(left, right), ylim=(low, top))  # the branches extend beyond the panel
+    zero = result.zero_of("stress")
+    moved = result.zero_of("displacement") / result.measurement.specimen.height
+    stress = np.linspace(0.0, top * labels.fy - zero, 200)
+    for name, strain in spring.elastic_branches(stress).items():
+        line = np.column_stack((strain + moved, (stress + zero) / labels.fy))
+        line = line[strain + moved < right]
+        if len(line):  # branch c may lie beyond the strains of the test
+            ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5, label=f"_branch {name}")
+            at = line[int(LIGHT[name[0]] * (len(line) - 1))]
+            labels.write(name, [at], color=GREY, fontsize=7)
+    if spring.relaxation and "s1" in result.snapping and result.strain is not None:
+        style: Any = {"color": "0.35", "lw": 0.7, "ls": (0, (4, 2)), "zorder": 3.5}
+        equilibrium = (result.snapping["s1"].stress + zero) / labels.fy
+        ax.plot(result.strain, equilibrium, label="equilibrium", **style)
+
+
+def _name_branches(labels: _Labels, panel: Panel, result: Fit) -> None:
+    """Write the names of the branches next to the curve of a single spring."""
+    springs, fitted = result.chain.springs, panel.fitted
+    if len(springs) > 1 or not springs[0].law.hysteretic or fitted is None:
+        return
+    for branch, stretch in _longest_visits(result, fitted).items():
+        x, y = fitted.x[stretch] / labels.fx, fitted.y[stretch] / labels.fy
+        middle = x[evenly(x, y, 3)[1]]
+        inner = np.column_stack((x, y))[evenly(x, y, 9)]
+        around = sorted(inner, key=lambda at: float(abs(at[0] - middle)))
+        side = SIDES[1:2] if x[-1] < x[0] else SIDES[:1]  # below the curve on the way back
+        labels.write(branch, around, side, color=BLUE, fontsize=7.0, label="_on branch")
+
+
+def _longest_visits(result: Fit, fitted: Line) -> dict[str, slice]:
+    """Return the samples of the longest visit (in strain) of a single spring to each branch."""
+    ends = [0, *_switch_samples(result, fitted), fitted.x.size - 1]
+    at_rest = next(iter(result.chain.springs[0].law.branches))
+    branches = [switch.source for switch in result.switches[:1]] or [at_rest]
+    branches += [switch.target for switch in result.switches]
+    visits, longest = dict[str, slice](), dict[str, float]()
+    for branch, start, end in zip(branches, ends, ends[1:], strict=False):
+        span = float(np.ptp(fitted.x[start : end + 1])) if end > start else 0.0
+        # Shorter visits, below 2 % of the range of strain, are vibrations.
+        if span > longest.get(branch, 0.02 * float(np.ptp(fitted.x))):
+            visits[branch], longest[branch] = slice(start, end + 1), span
+    return visits
+
+
+def _switch_samples(result: Fit, loop: Line) -> list[int]:
+    """Return the sample of the fitted loop (strain, stress) at which each switch occurs."""
+    samples, time = [0], result.curves.time
+    for switch in result.switches:
+        if time is not None and switch.time is not None:
+            samples.append(min(int(np.searchsorted(time, switch.time)), loop.x.size - 1))
+        else:  # the nearest sample after the previous switch
+            moved = switch.displacement + result.zero_of("displacement")
+            strain = moved / result.measurement.specimen.height
+            stress = switch.stress + result.zero_of("stress")
+            x, y = loop.x[samples[-1] :] - strain, loop.y[samples[-1] :] - stress
+            distance = np.hypot(x / (np.ptp(loop.x) or 1.0), y / (np.ptp(loop.y) or 1.0))
+            samples.append(samples[-1] + int(np.argmin(distance)))
+    return samples[1:]

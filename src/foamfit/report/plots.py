@@ -13,8 +13,16 @@ import numpy as np
 from foamfit.errors import InputError
 from foamfit.report import figures
 from foamfit.report.figures import GREY, TWO, VERMILION
-from foamfit.report.marks import annotate
-from foamfit.report.panels import Line, Panel, draw, draw_residuals, is_known, panels_of, size
+from foamfit.report.panels import (
+    Line,
+    Panel,
+    annotate,
+    draw,
+    draw_below,
+    is_known,
+    panels_of,
+    size,
+)
 from foamfit.report.readable import readable_unit
 from foamfit.terminal import printable
 
@@ -49,7 +57,7 @@ def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -
     more += [f"stopped by {result.stopped}"] if result.stopped else []
     title = " · ".join([name, result.law, f"{result.drive} drive", *more])
     known = is_known(result)
-    with _panelled(panels_of(result), width, title, residuals=True, known=known) as (figure, drawn):
+    with panelled(panels_of(result), width, title, strips=True, known=known) as (figure, drawn):
         for ax, panel, extent in drawn:
             annotate(ax, panel, result, extent)
     return figures.save(figure, path)
@@ -121,7 +129,7 @@ def plot_response(
         Panel("displacement-time", "time", "s", "displacement", "m", moving),
         Panel("stress-strain", "overall strain", "–", "base stress", "Pa", looped),
     ]
-    with _panelled(panels, width) as (figure, drawn):
+    with panelled(panels, width) as (figure, drawn):
         for ax, panel, _ in drawn[:2]:
             if end is not None:
                 style: Any = {
@@ -142,17 +150,17 @@ def origin_word(result: Fit) -> str | None:
 
 
 @contextmanager
-def _panelled(
-    panels: list[Panel], width: str, *title: str, residuals: bool = False, known: bool = False
+def panelled(
+    panels: list[Panel], width: str, *title: str, strips: bool = False, known: bool = False
 ) -> Iterator[tuple[Figure, list[Drawn]]]:
     """Yield a figure with its panels drawn, and add a legend at the end.
 
-    Residuals are drawn below the panels if wanted; for a `known` motion the first panel is largest.
+    Strips are drawn below the panels if wanted; for a `known` motion the first panel is largest.
     """
     count = max(len(panels), 1)
-    wide = min(figures.inches(width), MOST_WIDE[3 if known and count > 1 else len(panels)])
+    wide = min(figures.inches(width), MOST_WIDE[3 if known and count > 1 else min(len(panels), 3)])
     across = figures.abreast(wide, count)
-    rows, every = -(-count // across), 2 if residuals else 1
+    rows, every = -(-count // across), 2 if strips else 1
     parts = [WIDER if known else 1.0, *[1.0] * (across - 1)]
     spans = [72.0 * wide * part / sum(parts) - BESIDE_IT for part in parts]
     tall = LOOP if known and across > 1 else HEIGHT if rows == 1 else STACKED
@@ -170,9 +178,9 @@ def _panelled(
         for i, (ax, panel) in enumerate(zip(axes, panels, strict=False)):
             draw(ax, panel)
             high = tall
-            if residuals and any(line.residual is not None for line in panel.lines):
-                draw_residuals(ax, below[i], panel)
-            elif residuals:  # the panel fills their place
+            if strips and panel.below:
+                draw_below(ax, below[i], panel)
+            elif strips:  # the panel fills their place
                 below[i].remove()
                 at = ax.get_subplotspec().rowspan.start
                 ax.set_subplotspec(ax.get_gridspec()[at : at + 2, i % across])

@@ -7,6 +7,7 @@ import json
 import math
 from base64 import b64encode
 from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foamfit import text
@@ -35,6 +36,7 @@ def environment() -> Environment:
     made.filters.update(paragraphs=_paragraphs, aligned=_aligned)
     made.filters["svg"] = lambda svg: "data:image/svg+xml;base64," + b64encode(svg).decode()
     made.filters["quoted"] = functools.partial(json.dumps, ensure_ascii=False)
+    made.filters["filename"] = lambda path: Path(path).name
     made.filters["spoken"] = lambda name: name.replace("_", "-")
     made.globals["version"] = version("foamfit")
     return made

@@ -1,22 +1,18 @@
-"""Results as shown by Python and notebooks: a few lines of text, or one line and a table."""
+"""Results as Python and notebooks show them, and their folders."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
 
-from foamfit.report.plots import draw_loops
-from foamfit.report.readable import Readable, readable
+from foamfit.report.figures import TWO, inches
+from foamfit.report.folder import check_target, save_whole
+from foamfit.report.readable import Readable
 from foamfit.report.render import page
-from foamfit.report.tables import frame, stacked
-from foamfit.springs.parameters import NUISANCE
-from foamfit.text import counted, wrapped
-
-if TYPE_CHECKING:
-    import pandas as pd
-    from matplotlib.axes import Axes
-
-Joint = Any  # `foamfit.study.joint_result.JointResult`
+from foamfit.report.result_figures import Mapped
+from foamfit.text import wrapped
 
 
 def brief(title: str, line: str, rows: Sequence[Readable], html: bool, table: Any = None) -> str:
@@ -28,12 +24,43 @@ def brief(title: str, line: str, rows: Sequence[Readable], html: bool, table: An
     return "\n".join([*wrapped(f"{title}: {line}", 2), *wrapped(", ".join(values), 2)])
 
 
-class Shown:
-    """A result that Python shows in a few lines, and a notebook with a table."""
+def told(title: str, sentences: Sequence[str], html: bool) -> str:
+    """Return a result in sentences, as text or HTML."""
+    if html:
+        return page("told", title=title, sentences=sentences)
+    return "\n  ".join((title, *sentences))
+
+
+class Result:
+    """A result that Python shows in a few lines, a notebook as HTML, and a folder keeps."""
+
+    # The only kind of result, one of `folder.FILES`, that it may replace; None: any.
+    _replaces: ClassVar[str | None] = None
 
     def _shown(self, *, html: bool = False) -> str:
         """Return the result as text or HTML."""
         raise NotImplementedError
+
+    def write(self, folder: Path, *, pages: bool, width: str, mapped: Mapped) -> None:
+        """Write all files into an existing folder; pages and figures only with `pages`."""
+        raise NotImplementedError
+
+    @property
+    def failed(self) -> bool:
+        """Whether no acceptable fit was found."""
+        return getattr(self, "status", "") == "failed"
+
+    def text(self, *, verbose: bool = False) -> str:
+        """Return the text that the command prints; only that of a fit may be `verbose`."""
+        raise NotImplementedError
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the content of the JSON file of the result: SI, plain types, None if missing."""
+        raise NotImplementedError
+
+    def printed(self) -> dict[str, Any]:
+        """Return what the command prints as JSON."""
+        return self.to_json_dict()
 
     def __repr__(self) -> str:
         """Return the result in a few lines."""
@@ -42,34 +69,21 @@ class Shown:
     def _repr_html_(self) -> str:
         return self._shown(html=True)
 
+    def save(
+        self,
+        folder: str | Path,
+        *,
+        report: bool = True,
+        figure_width: str = TWO,
+        mapped: Mapped = map,
+    ) -> Path:
+        """Write the result folder and return its path; an older folder is replaced at the end.
 
-class JointViews(Shown):
-    """Plot, table and short text of a joint fit."""
-
-    def plot(self: Joint, ax: Axes | None = None) -> Axes:
-        """Draw the loops of all tests, measured and fitted, into axes or a new figure."""
-        return draw_loops(self.loops, ax)
-
-    def table(self: Joint) -> pd.DataFrame:
-        """Return a row for each test and parameter, in SI; common values have the test "".
-
-        `kind`, `scatter` and `b` are as in joint.json. The output of `to_latex` compiles.
+        Without `report`, neither pages nor figures are written. `figure_width` is "one" or "two"
+        columns, or a length ("85 mm"); ", untitled" after it omits the titles. `mapped` draws the
+        figures; give the `map` of an executor to draw them in parallel.
         """
-        common = {n: p for n, p in self.parameters.items() if p.kind != "own"}
-        more = ("kind", "scatter", "b")
-        columns = {key: {n: getattr(p, key) for n, p in common.items()} for key in more}
-        frames = {"": frame(common, **columns)}
-        for test in self.tests:
-            own = {n: p for n, p in self.parameters.items() if p.tests and test in p.tests}
-            kinds = {name: p.kind for name, p in own.items()}
-            each = {name: p.in_test(test) for name, p in own.items()}
-            frames[test] = frame(each, kind=kinds, scatter={}, b={})
-        return stacked(frames, "test")
-
-    def _shown(self: Joint, *, html: bool = False) -> str:
-        """Return name, model, number of tests, status and the common values."""
-        line = f"{self.model} · {counted(len(self.tests), 'test')} together · status {self.status}"
-        every = self.parameters.items()
-        common = {n: p for n, p in every if p.kind != "fixed" and n not in NUISANCE}
-        rows = [readable(name, p) for name, p in common.items()]
-        return brief(self.name, line, rows, html)
+        inches(figure_width)  # rejects an invalid width
+        check_target(folder, of=self._replaces)
+        drawn: Any = {"pages": report, "width": figure_width, "mapped": mapped}
+        return save_whole(folder, partial(self.write, **drawn))

@@ -148,30 +148,25 @@ def conclusions(result: Fit) -> tuple[str, ...]:
     Further sentences state the effect of the ± of the TOML and, for microscale springs and
     relaxation, the behaviour of the identified law.
     """
-    shown = compared(result)
-    timed = {name: x for name, x in shown.items() if name != CURVES["stress_strain"]} or shown
     springs = {name: p for name, p in result.parameters.items() if name not in NUISANCE}
-    certain = {name: p for name, p in springs.items() if p.state == "determined"}
-    widths = {  # half of the 95 % interval over the value
+    halves = {  # half of the 95 % interval over the value
         name: 0.5 * (p.ci95[1] - p.ci95[0]) / abs(p.value)
-        for name, p in certain.items()
-        if p.ci95 is not None and p.value and math.isfinite(p.ci95[1] - p.ci95[0])
+        for name, p in springs.items()
+        if p.state == "determined" and p.ci95 is not None and p.value
     }
-    ends = dict.fromkeys(choose(widths, key=widths.__getitem__) for choose in (min, max) if widths)
+    widths = sorted((half, name) for name, half in halves.items() if math.isfinite(half))
+    found, varied = count_determined(result.parameters)
     return sentences(
         "conclusions",
         result=result,
-        followed=[(name, percent(misfit)) for name, misfit in timed.items()],
-        determined=len(certain),
-        varied=sum(p.vary for p in springs.values()),
-        widths=[(name, percent(widths[name])) for name in ends],
+        shown=compared(result),
+        determined=found,
+        varied=varied,
+        widths=widths[:1] + widths[1:][-1:],
         unknown=_unknown(springs),
         weakest=[] if result.insight is None else list(result.insight.weakest()[1]),
         stated=STATED if result.budget is None else [*filter(result.budget.sources.count, STATED)],
         moved=_moved(result),
-        accepted=result.status != "failed",
-        several=len(result.chain.springs) > 1,
-        lost=[name for name, p in springs.items() if p.state == "not determined"],
     )
 
 

@@ -8,8 +8,8 @@ compile them twice.
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 
@@ -37,28 +37,17 @@ def run(loop: str, model: str = "microscale") -> None:
             scene.run(*chain.arrays[:2], 1e-2, directions=np.zeros((1, 2), np.int64))
 
 
-@contextmanager
-def at_first_use(
-    model: str = "bistable", relaxation: int = 0, announce: Callable[[], None] | None = None
-) -> Iterator[Callable[[], None]]:
-    """Announce what is compiled at first use, and yield the function that compiles it.
-
-    The body calls this function before it simulates.
-    """
+def compile_solver(model: str = "bistable", announce: Callable[[], None] | None = None) -> None:
+    """Announce and compile what a fit of a model needs, unless it is in the cache."""
     missing = [loop for loop in LOOPS if not cache.compiled(loop)]
-    if missing:
-        (announce or (lambda: cache.warn("the solver")))()
-
-    def finish() -> None:
-        if not missing:
-            return
-        cache.LOG.disabled = True  # it has been said that the solver is compiled
-        gc.disable()  # a fifth of the time
-        try:
-            while missing:
-                run(missing.pop(0), model if model != "auto" else "bistable+microscale")
-        finally:
-            gc.enable()
-            cache.LOG.disabled = False
-
-    yield finish
+    if not missing:
+        return
+    (announce or (lambda: cache.warn("the solver")))()
+    cache.LOG.disabled = True  # it has been said that the solver is compiled
+    gc.disable()  # a fifth of the time
+    try:
+        for loop in missing:
+            run(loop, model if model != "auto" else "bistable+microscale")
+    finally:
+        gc.enable()
+        cache.LOG.disabled = False

@@ -21,15 +21,15 @@ from foamfit.fitting.problem import check_fixed_and_varied
 from foamfit.one_model import Options
 from foamfit.options import Keywords
 from foamfit.parts import law_in_words
+from foamfit.report import listing as tables
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import FILES, check_target, is_written
-from foamfit.report.studies import batch as tables
-from foamfit.report.studies.batch import Row
-from foamfit.solve import cache, precompile
+from foamfit.report.listing import Row
+from foamfit.solve import precompile
 from foamfit.springs.model import Model, with_options
 from foamfit.study.batch_work import Outcome, Recipe, Task, fingerprint, put, stored, work
 from foamfit.study.processes import FITS, PAGES, EndedError, Processes, cores
-from foamfit.study.test_files import find_tests
+from foamfit.study.study_file import find_tests
 from foamfit.terminal import without_ctrl_c
 from foamfit.text import counted
 
@@ -88,7 +88,7 @@ class Batch:
     def fit(self, executor: Executor) -> None:
         """Fit all tests without a stored result; write a summary even if this ends early."""
         try:
-            for i, (name, path) in enumerate(self.tests):
+            for name, path in self.tests:
                 self._begin(executor, name, path)
                 while (
                     len(self.waiting) >= MOST_AHEAD
@@ -96,8 +96,6 @@ class Batch:
                 ):
                     self._collect(1.0)
                 self._collect(0.0)
-                while i == 0 and not self.foreign and self._is_cold() and self.waiting:
-                    self._collect(1.0)  # the first fit compiles for all others
             while self.waiting:
                 self._collect(1.0)
         except BaseException as error:
@@ -113,13 +111,6 @@ class Batch:
             done = f"{len(self.rows)} of {counted(len(self.tests), 'test')} are done and kept"
             raise InputError(f"{why}; {done}; call again to fit the others") from error
         self.save(whole=True)
-
-    def _is_cold(self) -> bool:
-        """Return whether the first fit compiles functions that the other fits need too."""
-        model = self.recipe.model
-        memory = model == "auto" or self.recipe.options["relaxation"] > 0
-        memory = memory or any(law.remembers for law in Model.parse(model).laws)
-        return memory and not cache.compiled("follow")
 
     def _begin(self, executor: Executor, name: str, path: Path) -> None:
         """Use the stored rows of a test, or submit its fit."""
@@ -199,7 +190,7 @@ def batch(
     Parameters
     ----------
     tests : str, Path or several
-        Files, folders and globs; see `foamfit.study.test_files.find_tests`.
+        Files, folders and globs; see `foamfit.study.study_file.find_tests`.
     out : str or Path, optional
         The folder; by default ``fits/batch/<model>``. It contains the result folder ``<test>/``
         of each test, ``summary.csv`` and ``summary.html``.
@@ -227,7 +218,7 @@ def batch(
         width is fitted again, because its curves are not stored.
     progress : callable, optional
         Called with the `Batch` after each test; its `rows`, `tests`, `wrong` and `fitted` describe
-        the progress.
+        the progress, and at the end its `summary` the results.
 
     Returns
     -------
@@ -242,55 +233,31 @@ def batch(
     numbers = () if cycle == "all" else cycle
     if numbers is not None and not isinstance(numbers, int):
         numbers = tuple(int(number) for number in numbers)
-    done = run(
-        tests,
-        Recipe(model, options, numbers, report, figure_width, history=cycles),
-        out=out,
-        executor=executor,
-        jobs=jobs,
-        fresh=fresh,
-        specimen=specimen,
-        progress=progress,
-    )
-    return tables.table(done.summary)
-
-
-def run(
-    tests: Tests,
-    recipe: Recipe,
-    *,
-    out: str | Path | None = None,
-    executor: Executor | None = None,
-    jobs: int | None = None,
-    fresh: bool = False,
-    specimen: str | Path | None = None,
-    progress: Callable[[Batch], None] | None = None,
-) -> Batch:
-    """Fit the tests as `batch` does, and return the finished `Batch`."""
-    options = Options.of("batch", recipe.options)
-    recipe = replace(recipe, model=_checked(recipe.model, options), options=vars(options))
+    chosen = Options.of("batch", options)
+    named = _checked(model, chosen)
+    recipe = Recipe(named, vars(chosen), numbers, report, figure_width, history=cycles)
     if jobs is not None:
         check_whole("jobs", jobs, 1)
-    if recipe.cycles is not None and recipe.history is not None:
+    if numbers is not None and cycles is not None:
         raise InputError("give either cycle or cycles, not both")
     if jobs is not None and executor is not None:
         raise InputError("jobs and an executor exclude each other; leave one of them out")
-    inches(recipe.width)  # rejects an invalid width
+    inches(figure_width)  # rejects an invalid width
     toml = None if specimen is None else Path(specimen)
     if toml is not None and not toml.is_file():
         raise InputError(f"{toml}: no such file; give the TOML of the specimen for all tests")
-    folder = Path("fits", "batch", recipe.model) if out is None else Path(out)
-    named, notify = find_tests(tests), progress or (lambda _: None)
-    made = Batch(folder, recipe, named, toml, executor is not None, fresh, notify)
+    folder = Path("fits", "batch", named) if out is None else Path(out)
+    found, notify = find_tests(tests), progress or (lambda _: None)
+    made = Batch(folder, recipe, found, toml, executor is not None, fresh, notify)
     _check_out(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        sweep(folder.resolve(), [*(name for name, _ in named), *FILES["batch.json"]])
+        sweep(folder.resolve(), [*(name for name, _ in found), *FILES["batch.json"]])
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {reason(error)}") from None
     with _executor(executor, jobs, made) as runner:
         made.fit(runner)
-    return made
+    return tables.read_table(folder / "summary.csv")
 
 
 def _checked(model: str, options: Options) -> str:
@@ -336,9 +303,7 @@ def _executor(given: Executor | None, jobs: int | None, made: Batch) -> Iterator
     if given is not None:
         yield given
         return
-    if not cache.compiled():
-        with precompile.at_first_use() as finish:
-            finish()
+    precompile.compile_solver(made.recipe.model)
     count = min(jobs or cores(), max(len(made.tests), 1))
     try:
         with Processes(count, (*FITS, *(PAGES if made.recipe.pages else ()))) as pool:

@@ -25,8 +25,7 @@ from foamfit.data.toml_file import motion_file
 from foamfit.errors import InputError, SimulationError
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import save_whole, write_result
-from foamfit.report.studies.batch import REFUSED, Row, row_of
-from foamfit.report.studies.cycles import write_cycles
+from foamfit.report.listing import REFUSED, Row, row_of
 from foamfit.springs import laws
 from foamfit.study.cycles import fit_cycles
 
@@ -185,7 +184,7 @@ def _fitted(task: Task) -> tuple[tuple[Row, ...], Write]:
 def _results(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write]:
     """Return one row, or one per cycle (a subfolder), and a function that writes the files."""
     recipe, file = task.recipe, str(task.path)
-    pictures: dict[str, Any] = {"pages": recipe.pages, "width": recipe.width}
+    pictures: Any = {"pages": recipe.pages, "width": recipe.width, "mapped": map}
     if not isinstance(recipe.cycles, tuple):
         test = read_test(path, toml, recipe.cycles, cycles=recipe.history)
         result = fit(test, model=recipe.model, **recipe.options)
@@ -199,7 +198,7 @@ def _results(task: Task, path: Path, toml: Path) -> tuple[tuple[Row, ...], Write
             rows.append(row_of(name, file, fits.results[number]))
         else:
             rows.append(Row(name, file, REFUSED, " ".join(fits.refused[number].split())))
-    return tuple(rows), partial(write_cycles, fits, **pictures)
+    return tuple(rows), partial(fits.write, **pictures)
 
 
 @contextmanager

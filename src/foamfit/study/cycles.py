@@ -1,21 +1,157 @@
-"""Separate fits of the cycles of one record."""
+"""Separate fits of the cycles of one record: their folder, table, text and figure."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
-from typing import Unpack
+from typing import TYPE_CHECKING, Any, Unpack
+
+import numpy as np
 
 from foamfit.api import fit
 from foamfit.arrays import single_threaded
+from foamfit.codec import plain
 from foamfit.data.csv_file import read_test
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.search import what_stopped
 from foamfit.one_model import Options, Progress
 from foamfit.options import Keywords
-from foamfit.report.studies.cycles import CycleFits
+from foamfit.parts import ParameterEstimate
+from foamfit.report import figures
+from foamfit.report.figures import TWO
+from foamfit.report.folder import write_json, write_result, write_table, write_text
+from foamfit.report.plots import draw_loops
+from foamfit.report.readable import own_name
+from foamfit.report.render import words
+from foamfit.report.result_figures import Mapped
+from foamfit.report.shown import Result, brief
+from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
+from foamfit.report.summary import CURVES
+from foamfit.report.tables import by_test, by_test_tex, frame, stacked, varied, wide
 from foamfit.results import Fit
+from foamfit.springs.parameters import NUISANCE
+from foamfit.text import counted, percent
 from foamfit.trust.intervals import Announce
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SCHEMA = 1
+ENERGY = "dissipated_energy"
+MOST_LOOPS = 12
+MOST_NAMES = 12  # more parameters than this are not printed; all are in cycles.csv
+# Panels next to the parameters: columns of cycles.csv (SI), and their factors.
+BY_CYCLE = {
+    "start\nstrain (%)": ("start_strain", 100.0),
+    "dissipated\n(kJ/m³)": ("dissipated_energy", 1e-3),
+    "misfit of\nthe loop (%)": ("misfit_stress_strain", 100.0),
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CycleFits(Result):
+    """Fits of the cycles of one record."""
+
+    test: str  #: Name of the test
+    model: str  #: Name of the model
+    recorded: tuple[int, ...]  #: Numbers of all cycles in the record
+    results: dict[int, Fit]  #: Fit of each cycle that could be read and fitted
+    refused: dict[int, str]  #: Reason for each of the other cycles, one sentence
+    data_sha256: str = ""  #: Digest of the record
+    options: dict[str, Any] | None = None  #: As `Fit.options`, with the numbers of the cycles
+
+    @property
+    def varied(self) -> dict[str, list[ParameterEstimate | None]]:
+        """Parameters of the springs that vary in any fit, with their values in ascending cycles."""
+        every = varied([one.parameters for _, one in sorted(self.results.items())])
+        return {name: each for name, each in every.items() if name not in NUISANCE}
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Yield the rows of cycles.csv in SI, one per cycle; None for missing values."""
+        every = {n: self.results.get(n) for n in sorted({*self.results, *self.refused})}
+        parameters = wide([{} if one is None else one.parameters for one in every.values()])
+        names = ["start_strain", "peak_strain", "peak_stress", ENERGY]
+        names += [f"misfit_{name}" for name in CURVES]
+        for (number, one), own in zip(every.items(), parameters, strict=True):
+            cells: list[Any] = [None] * len(names)
+            status = "refused"
+            if one is not None:
+                m, status = one.measurement, one.status
+                moved, height = m.displacement, m.specimen.height
+                strain = None if moved is None else moved.max() / height
+                stress = None if m.stress is None else m.stress.max()
+                cells = [m.start_strain, strain, stress, one.energy.get(ENERGY)]
+                cells += map(one.misfit.get, CURVES)
+            row = {"cycle": number, **dict(zip(names, plain(cells), strict=True))}
+            yield row | {"status": status, "error": self.refused.get(number), **own}
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the content of cycles.json, in plain types."""
+        content = {"schema": SCHEMA, "foamfit": version("foamfit"), "fitted": sorted(self.results)}
+        names = (one.name for one in fields(self) if one.name != "results")
+        return dict(plain(content | {name: getattr(self, name) for name in names}))
+
+    def printed(self) -> dict[str, Any]:
+        """Return what the command prints as JSON: also the fits."""
+        each = {n: one.to_json_dict() for n, one in sorted(self.results.items())}
+        return self.to_json_dict() | {"cycles": each}
+
+    @property
+    def failed(self) -> bool:
+        """Whether no acceptable fit was found of any cycle."""
+        return all(one.status == "failed" for one in self.results.values())
+
+    def text(self, *, verbose: bool = False) -> str:
+        """Return the text that the command prints."""
+        names = list(self.varied) if len(self.varied) <= MOST_NAMES else []
+        shown = {name: own_name(name, self.model) for name in names}
+        return words("cycles", found=self, names=shown)
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the loops of all cycles, measured and fitted, into axes or a new figure."""
+        every = ((n, one.loop) for n, one in sorted(self.results.items()))
+        loops = (loop._replace(name=f"cycle {n}") for n, loop in every if loop is not None)
+        return draw_loops(loops, ax)
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each cycle and parameter, in SI; the output of `to_latex` compiles."""
+        results = sorted(self.results.items())
+        return stacked({n: frame(one.parameters) for n, one in results}, "cycle")
+
+    @property
+    def by_cycle(self) -> pd.DataFrame:
+        """The rows of cycles.csv, indexed by cycle."""
+        import pandas as pd
+
+        return pd.DataFrame(list(self.rows())).set_index("cycle")
+
+    def _shown(self, *, html: bool = False) -> str:
+        """Return the number of fitted cycles and their misfits; in HTML also their parameters."""
+        cycles = counted(len(self.recorded), "cycle")
+        line = f"{self.model} · {len(self.results)} of {cycles} fitted"
+        misfits = (one.misfit.get("stress_strain") for one in self.results.values())
+        if known := [misfit for misfit in misfits if misfit is not None]:
+            line += f" · misfit {percent(min(known))} to {percent(max(known))}"
+        table = by_test(list(map(str, sorted(self.results))), self.varied) if html else {}
+        return brief(self.test, line, [], html, table and {"first": "cycle", **table})
+
+    def write(self, folder: Path, *, pages: bool, width: str, mapped: Mapped) -> None:
+        """Write ``cycle-<n>/``, cycles.csv, cycles.json, table.tex and figures."""
+        for number, result in self.results.items():
+            inner = folder / f"cycle-{number}"
+            inner.mkdir()
+            write_result(result, inner, pages=pages, width=width, mapped=mapped)
+        write_table(folder / "cycles.csv", self.rows())
+        write_json(folder / "cycles.json", self.to_json_dict())
+        numbers = [str(number) for number in sorted(self.results)]
+        write_text(folder / "table.tex", by_test_tex("Cycle", numbers, self.varied))
+        if pages:
+            figures.write_both(plot_cycles(self, width=width), folder / "cycles")
 
 
 @single_threaded
@@ -78,3 +214,37 @@ def fit_cycles(
             break
     made = first.data_sha256, chosen.stored(first, model, wanted)
     return CycleFits(first.name, model, first.cycles, results, refused, *made)
+
+
+def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
+    """Draw all loops in one panel, and start strain, energy, misfit and parameters by cycle.
+
+    For the parameters and `width` see `plot_parameters`. At most `MOST_LOOPS` loops are drawn.
+    """
+    results = dict(sorted(found.results.items()))
+    loops = [
+        loop._replace(
+            name=f"cycle {number}",
+            along=loop.along + one.measurement.start_strain,
+            label="strain from the first contact",
+        )
+        for number, one in results.items()
+        if (loop := one.loop) is not None and loop.label == "strain"
+    ]
+    keep = np.unique(np.geomspace(1, max(len(loops), 1), MOST_LOOPS).astype(int)) - 1
+    rows, panels = list(found.rows()), list[Panel]()
+    for title, (column, factor) in BY_CYCLE.items():
+        known = {f"cycle {row['cycle']}": row[column] for row in rows if row[column] is not None}
+        values = {
+            cycle: ParameterEstimate(factor * x, None, None, "", True, "determined", "")
+            for cycle, x in known.items()
+        }
+        panels.append(Panel(column, title, values))
+    names = [f"cycle {number}" for number in results]
+    return plot_parameters(
+        f"{found.test} · {found.model}",
+        names,
+        [*panels, *panels_of(names, found.varied)],
+        width=width,
+        above=partial(draw_loops, [loops[i] for i in keep[: len(loops)]]),
+    )

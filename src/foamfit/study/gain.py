@@ -249,7 +249,7 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
             ends = 2.0 * known.sizes[i] * np.quantile(halves[shown, i], (0.1, 0.5, 0.9))
             share = float(np.median(shares[shown, i]))
         low, middle, high = ends.tolist()
-        out[name] = Expected(middle, (low, high), share, state, chance)
+        out[name] = Expected(middle, state, (low, high), chance, share)
     return out
 
 

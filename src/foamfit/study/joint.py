@@ -28,8 +28,9 @@ from foamfit.report.folder import try_target
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
 from foamfit.study.joint_fit import Map, fit_jointly
-from foamfit.study.joint_result import FEW_FOLDERS, JointResult, result_of
-from foamfit.study.processes import begin, workers
+from foamfit.study.joint_parameters import result_of
+from foamfit.study.joint_result import FEW_FOLDERS, JointResult
+from foamfit.study.processes import workers
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
 from foamfit.trust.settle import follow_samples, keep_to_record, weigh_motion
@@ -98,8 +99,6 @@ def joint(
     study = study if seed is None else replace(study, seed=seed)
     if out is not None:
         try_target(out)
-        if report:
-            begin(jobs, len(study.tests), FEW_FOLDERS)
     options = Options(
         drive=study.drive, seed=study.seed, starts=study.starts, relaxation=study.relaxation
     )
@@ -126,7 +125,8 @@ def joint(
         result = result_of(study, files, rates, rate0, fit, alone, slopes, **about)
     tell(1.0, "done")
     if out is not None:
-        result.save(out, jobs=jobs, report=report)
+        with workers(jobs, len(result.tests), FEW_FOLDERS) as each:
+            result.save(out, report=report, mapped=each)
     return result
 
 

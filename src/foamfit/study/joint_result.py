@@ -1,76 +1,50 @@
-"""The result of a joint fit: values, intervals, states, sentences, and the file joint.json."""
+"""The result of a joint fit: joint.json, text, page and figure, and a folder per test."""
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from foamfit.api import FitResult
-from foamfit.arrays import Array
 from foamfit.codec import plain
-from foamfit.data.calibration import contradictions
 from foamfit.fitting.links import RATES
-from foamfit.fitting.problem import Problem
-from foamfit.fitting.search import SearchRecord
-from foamfit.fitting.together import Together
-from foamfit.parts import ParameterEstimate
-from foamfit.report import render
-from foamfit.report.figures import TWO, inches
-from foamfit.report.folder import check_target
-from foamfit.report.shown import JointViews
-from foamfit.report.studies.joint import save_joint
-from foamfit.results import SCHEMA, Fit, Loop, loop_of
+from foamfit.parts import ParameterEstimate, law_in_words
+from foamfit.report import figures
+from foamfit.report.figures import TWO
+from foamfit.report.folder import write_json, write_result, write_text
+from foamfit.report.listing import Row, table_of
+from foamfit.report.plots import draw_loops
+from foamfit.report.readable import readable, readable_unit
+from foamfit.report.render import page, words
+from foamfit.report.result_figures import Mapped
+from foamfit.report.shown import Result, brief
+from foamfit.report.studies.parameters import Panel, plot_parameters
+from foamfit.report.tables import MISFITS, formula, frame, parameters_tex, stacked, symbols
+from foamfit.results import SCHEMA, Fit, Loop
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import NUISANCE, unit_of
+from foamfit.springs.parameters import NUISANCE
 from foamfit.study.joint_fit import Alternative, JointFit
-from foamfit.study.processes import workers
-from foamfit.study.study_file import Study
-from foamfit.text import counted, listed, percent
-from foamfit.trust import covariance
-from foamfit.trust.best_point import BestPoint
-from foamfit.trust.checklist import POOR, UNACCEPTABLE, status_of, warnings_of
-from foamfit.trust.conclude import conclude, noise_of
-from foamfit.trust.contested import judged, settle, unsettled
-from foamfit.trust.covariance import Ends
+from foamfit.text import counted, number
+from foamfit.trust.covariance import RULE
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Largest number of result folders written in this process: each takes a second or two.
 FEW_FOLDERS = 3
-# Items of the checklist that apply only to a search.
-_OF_A_SEARCH = ("ended", "agree")
-_BLANK = ParameterEstimate(math.nan, systematic=None)  # known for the fits of single tests only
-LARGEST = 300.0  # largest logarithm of a common value that the tests do not determine
 _NOT_IN_FILE = ("loops", "fits", "fit")  # fields that joint.json does not contain
-DOMINANT = 0.5  # a test with at least this share of χ² causes a warning
-
-
-def fit_of_test(
-    problem: Problem, values: Array, parameters: dict[str, ParameterEstimate], note: str, seed: int
-) -> Fit:
-    """Return the result of a test in a joint fit; `systematic` is from this test alone."""
-    problem.put(values)
-    alone = conclude(BestPoint(problem, values), SearchRecord(seed, 0, time.perf_counter()))
-    checklist = tuple(check for check in alone.checklist if check.key not in _OF_A_SEARCH)
-    own = {
-        name: replace(one, systematic=alone.parameters.get(name, one).systematic)
-        for name, one in parameters.items()
-    }
-    return replace(
-        alone,
-        parameters=own,
-        notes=(note, *alone.notes),
-        checklist=checklist,
-        status=status_of(checklist),
-        warnings=warnings_of(checklist),
-        budget=None,
-    )
+MOST_ROWS = 60  # of the table of tests on the terminal
+MOST_LOOPS = 48
+SEVERAL_RATES = 1.5  # ratio of rates; those of nominally equal tests differ by a few percent
 
 
 @dataclass(frozen=True)
@@ -91,7 +65,7 @@ class JointTest:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class JointResult(JointViews):
+class JointResult(Result):
     """The result of a joint fit; the fields are those of joint.json, except the last ones.
 
     "covariance" is that of shared values, common values of scattering parameters, and for rate laws
@@ -132,25 +106,77 @@ class JointResult(JointViews):
         """Mean strain rate on loading of each test, 1/s."""
         return tuple(one.rate for one in self.tests.values())
 
-    def save(
-        self,
-        folder: str | Path,
-        *,
-        jobs: int | None = None,
-        report: bool = True,
-        figure_width: str = TWO,
-    ) -> Path:
-        """Write joint.json, its page, pictures and table.tex, and a result folder per test.
+    @property
+    def varied(self) -> dict[str, ParameterEstimate]:
+        """Parameters of the springs except those that are fixed."""
+        return {n: p for n, p in self.of_springs.items() if p.kind != "fixed"}
 
-        An older result in the folder is replaced at the end, all at once. The folders of the tests
-        are written by `jobs` processes (by default one per core). Without `report`, only tables are
-        written. The width of figures is "one" or "two" columns or a length ("85 mm"). Returns the
-        folder.
+    @property
+    def of_springs(self) -> dict[str, ParameterEstimate]:
+        """Parameters of the springs except those fixed at zero."""
+        every = self.parameters.items()
+        return {n: p for n, p in every if n not in NUISANCE and (p.kind != "fixed" or p.value)}
+
+    @property
+    def law(self) -> str:
+        """The model and its relaxation in words."""
+        return law_in_words(self.model, self.relaxation)
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the loops of all tests, measured and fitted, into axes or a new figure."""
+        return draw_loops(self.loops, ax)
+
+    def table(self) -> pd.DataFrame:
+        """Return a row for each test and parameter, in SI; common values have the test "".
+
+        `kind`, `scatter` and `b` are as in joint.json. The output of `to_latex` compiles.
         """
-        inches(figure_width)  # rejects an invalid width
-        check_target(folder)
-        with workers(jobs, len(self.tests), FEW_FOLDERS) as each:
-            return save_joint(self, folder, each, report=report, width=figure_width)
+        common = {n: p for n, p in self.parameters.items() if p.kind != "own"}
+        more = ("kind", "scatter", "b")
+        columns = {key: {n: getattr(p, key) for n, p in common.items()} for key in more}
+        frames = {"": frame(common, **columns)}
+        for test in self.tests:
+            own = {n: p for n, p in self.parameters.items() if p.tests and test in p.tests}
+            kinds = {name: p.kind for name, p in own.items()}
+            each = {name: p.in_test(test) for name, p in own.items()}
+            frames[test] = frame(each, kind=kinds, scatter={}, b={})
+        return stacked(frames, "test")
+
+    def _shown(self, *, html: bool = False) -> str:
+        """Return name, model, number of tests, status and the common values."""
+        line = f"{self.model} · {counted(len(self.tests), 'test')} together · status {self.status}"
+        rows = [readable(name, p) for name, p in self.varied.items()]
+        return brief(self.name, line, rows, html)
+
+    def text(self, *, verbose: bool = False) -> str:
+        """Return the text that the command prints."""
+        every = {n: p for n, p in self.parameters.items() if p.kind != "fixed" or p.value}
+        known = [one.misfit for one in self.tests.values()]
+        curves = [n for n in MISFITS if any(misfit.get(n) is not None for misfit in known)]
+        more: Any = {"parameters": every, "nuisance": NUISANCE, "between": _between}
+        return words("joint", found=self, most=MOST_ROWS, curves=curves, **more)
+
+    def write(
+        self, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
+    ) -> None:
+        """Write joint.json, its page, its figure, table.tex, and a result folder per test."""
+        write_json(folder / "joint.json", self.to_json_dict())
+        shown = self.of_springs
+        kinds = {name: one.kind for name, one in shown.items()}
+        between = {name: _between(one) for name, one in shown.items()}
+        write_text(folder / "table.tex", parameters_tex(shown, kinds=kinds, between=between))
+        folders, n = [folder / name for name in self.tests], len(self.tests)
+        # If other processes write these folders, the common figure is drawn at the same time.
+        written = mapped(_write_test, self.fits, folders, [pages] * n, [width] * n)
+        svg = b""
+        if pages:
+            svg = figures.write_both(plot_joint(self, width=width), folder / "joint")
+            if width != TWO:  # the page has room for two columns
+                svg = figures.image(plot_joint(self), "svg")
+        for _ in written:
+            pass
+        if pages:
+            write_text(folder / "joint.html", joint_page(self, folder, svg))
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of joint.json: SI units, plain types, null for missing values."""
@@ -163,314 +189,82 @@ class JointResult(JointViews):
         return shown
 
 
-def result_of(
-    study: Study,
-    tests: Mapping[str, Path],
-    rates: Sequence[float | None],
-    rate0: float | None,
-    fit: JointFit,
-    alone: Together,
-    slopes: Mapping[str, float],
-    **about: Any,
-) -> JointResult:
-    """Return the result of a joint fit of `tests` (names and files) at these rates (1/s).
+def _write_test(one: Callable[[], Fit] | Fit, folder: Path, report: bool, width: str) -> None:
+    folder.mkdir()
+    write_result(one if isinstance(one, Fit) else one(), folder, pages=report, width=width)
 
-    `alone` are the separate fits, and `slopes` those of `joint_fit.evidence`. `about` has further
-    fields of the result.
-    """
-    found, parameters = fit.found, parameters_of(fit, tuple(tests))
-    total = float(np.sum(found.costs))
-    shares = np.divide(found.costs, total) if total else np.full(len(tests), 1.0 / len(tests))
-    others = counted(len(tests) - 1, "other test")
-    note = f"Fitted together with {others} ({study.name}): intervals use all of them."
-    of_tests, fits, loops = dict[str, JointTest](), list[Callable[[], Fit]](), list[Loop]()
-    pairs = zip(tests.items(), rates, fit.point.bests, strict=True)
-    for t, ((name, file), rate, best) in enumerate(pairs):
-        problem, values, curves = best.problem, found.values[t], best.simulated.curves
-        measurement, objective = problem.measurement, problem.objective
-        estimates = _estimates(problem, values, name, parameters)
-        of_tests[name] = JointTest(
-            file=str(file),
-            drive=objective.drive,
-            rate=rate,
-            misfit=found.misfits[t],
-            chi2_share=float(shares[t]),
-            noise=noise_of(best, fit.point.errors[t]),
-            n_data=objective.n_data,
-            data_sha256=measurement.data_sha256,
-            values={one: estimate.value for one, estimate in estimates.items()},
+
+def _between(one: ParameterEstimate) -> str:
+    """Return a description of the variation of a parameter between the tests."""
+    return words("between", one=one)
+
+
+def joint_page(found: JointResult, folder: Path, figure: bytes) -> str:
+    """Return the page in a folder, with its figure (SVG)."""
+    varied = {n: p.tests for n, p in found.parameters.items() if p.kind != "fixed" and p.tests}
+    rows = [
+        Row(
+            test,
+            misfit=own.misfit,
+            parameters={n: found.parameters[n].in_test(test) for n in varied if test in varied[n]},
+            more=_more(found, own),
         )
-        fits.append(partial(fit_of_test, problem, values, estimates, note, study.seed))
-        loop = loop_of(measurement, curves.get("stress_strain"), curves.get("stress_time"))
-        loops += [] if loop is None else [loop._replace(name=name)]
-    drives = {one.drive for one in of_tests.values()}
-    result = JointResult(
-        name=study.name,
-        model=study.model,
-        relaxation=study.relaxation,
-        drive=drives.pop() if len(drives) == 1 else None,
-        seed=study.seed,
-        tests=of_tests,
-        rate0=rate0,
-        parameters=parameters,
-        covariance={"names": fit.point.names, "matrix": _common_covariance(fit)},
-        specimens={"names": fit.correlation[0], "correlation": fit.correlation[1]},
-        statistics=_statistics(fit, alone),
-        loops=tuple(loops),
-        fits=tuple(fits),
-        fit=fit,
-        **about,
-    )
-    return _with_words(result, fit, alone, slopes)
+        for test, own in found.tests.items()
+    ]
+    shown = [(one, readable(name, one), _between(one)) for name, one in found.of_springs.items()]
+    told: dict[str, Any] = {"found": found, "figure": figure, "parameters": shown, "rule": RULE}
+    return page("joint", table=table_of(rows, folder), **told)
 
 
-def _estimates(
-    problem: Problem, values: Array, test: str, parameters: Mapping[str, ParameterEstimate]
-) -> dict[str, ParameterEstimate]:
-    """Return the parameters of one test, as in its fit.json."""
-    out = dict[str, ParameterEstimate]()
-    for name, value in zip(problem.names, (values + problem.origins).tolist(), strict=True):
-        if problem.is_exact(name):
-            continue
-        one, param = parameters[name], problem.params[name]
-        if param.vary:
-            at = one.in_test(test)
-            method = at.ci95 and "local covariance"
-            out[name] = replace(at, value=value, ci95_method=method, range=None)
-        else:
-            why = "held fixed" if param.expr is None else f"tied by {param.expr}"
-            out[name] = ParameterEstimate(value, None, None, one.unit, False, "fixed", why)
+def _more(found: JointResult, own: JointTest) -> dict[str, Any]:
+    """Return the cells of a test that only joint fits have: rate, share of χ² and noise."""
+    rate = "" if own.rate is None else f"{own.rate:.3g}"
+    out = {"rate (1/s)": (rate, ""), "share of χ² (%)": (f"{100 * own.chi2_share:.1f}", "")}
+    for curve in MISFITS:
+        levels = [one.noise[curve]["sigma"] for one in found.tests.values() if curve in one.noise]
+        if curve in own.noise:
+            unit = "m" if curve.startswith("displ") else "Pa"
+            factor, unit = readable_unit(max(levels), unit)
+            level = own.noise[curve]
+            note = words("noise", level=level, factor=factor)
+            out[f"noise {MISFITS[curve]} ({unit})"] = (number(level["sigma"] / factor), note)
     return out
 
 
-def _statistics(fit: JointFit, alone: Together) -> dict[str, float | int]:
-    """Return statistics of the joint fit and of the separate fits."""
-    found = fit.found
-    return {
-        "n_tests": len(found.problems),
-        "n_data": found.n_data,
-        "n_vary": found.n_vary,
-        "chisqr": found.cost,
-        "redchi": found.cost / max(found.n_data - found.n_vary, 1),
-        "n_effective": fit.point.uncertainty.covariance.effective,
-        "n_eff": alone.n_eff,
-        "bic": found.bic(alone.n_eff),
-        "bic_alone": alone.bic(alone.n_eff),
-        "n_vary_alone": alone.n_vary,
-        "chisqr_alone": alone.cost,
-    }
+def plot_joint(found: JointResult, *, width: str = TWO) -> Figure:
+    """Draw the loops, and below them the parameters of all tests side by side.
 
-
-def _common_covariance(fit: JointFit) -> Array:
-    """Return the covariance of common values and slopes, SI; see `JointResult`."""
-    point, count = fit.point, len(fit.point.names)
-    scales = np.ones(count)
-    for i, name in enumerate(point.names):
-        if fit.found.links.kind(name) == "scatter":
-            spread, error = fit.spreads.get(name), point.of_common(name)[0]
-            scales[i] = math.exp(min(spread.mean, LARGEST)) if spread else fit.found.common[name][0]
-            scales[i] *= spread.stderr / error if spread and error > 0.0 else 1.0
-    matrix = point.uncertainty.covariance.matrix[:count, :count]
-    return np.asarray(matrix * np.outer(scales, scales))
-
-
-def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, ParameterEstimate]:
-    """Return all parameters of the joint fit, those of the springs first."""
-    problems = fit.found.problems
-    found = {
-        name: parameter_of(fit, tests, name)
-        for name in (*problems[0].model.names, *NUISANCE)
-        if any(name in one.index and not one.is_exact(name) for one in problems)
-    }
-    for test, best in zip(tests, fit.point.bests, strict=True):
-        settled = settle(best, unsettled(best, contradictions(best.problem.measurement)))
-        for name in best.problem.free() if settled else ():
-            found[name] = _contested(found[name], test, partial(judged, settled, best, name))
-    return found
-
-
-def _contested(
-    one: ParameterEstimate, test: str, judge: Callable[[Ends, tuple[str, str]], tuple[str, str]]
-) -> ParameterEstimate:
-    """Return a parameter with the states that contradictions in the record of a test leave it."""
-    if one.ci95 is not None and one.state:
-        state, why = judge(one.ci95, (one.state, one.why))
-        one = replace(one, state=state, why=why)
-    if one.tests is None or test not in one.tests:
-        return one
-    own = _contested(one.tests[test], "", judge)
-    return replace(one, tests={**one.tests, test: own})
-
-
-def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> ParameterEstimate:
-    """Return one parameter of the joint fit."""
-    found, kind = fit.found, fit.found.links.kind(name)
-    free = [t for t, problem in enumerate(found.problems) if name in problem.free()]
-    each = _values(fit, tests, name)
-    if not free:
-        fixed = next(iter(each.values()))
-        value = float(np.median([one.value for one in each.values()]))
-        return replace(fixed, value=value, kind="fixed")
-    if kind == "own":
-        value = float(np.median([each[tests[t]].value for t in free]))
-        why = "one value for each test; this is their median"
-        return replace(_BLANK, value=value, unit=unit_of(name), why=why, kind=kind, tests=each)
-    if kind == "scatter":
-        return _scattering(fit, name, each)
-    (value, *slope), span = found.common[name], fit.ranges.get(name)
-    one = _judged(fit, free[0], name, value, fit.point.of_common(name), span)
-    why = f"one value for {counted(len(free), 'test')}: {one.why}"
-    why = f"at the rate of the median test; {why}" if slope else why
-    joint = replace(one, why=why, range=span, kind=kind)
-    if not slope:
-        return joint
-    b, (error, freedom) = slope[0], fit.point.of_common(f"{name}:b")
-    half = covariance.half_width(error, freedom)
-    determined = math.isfinite(half)
-    return replace(
-        joint,
-        tests=each,
-        b=b,
-        b_stderr=error if determined else None,
-        b_ci95=(b - half, b + half) if determined else None,
-        b_range=fit.ranges.get(f"{name}:b"),
-    )
-
-
-def _scattering(fit: JointFit, name: str, tests: dict[str, ParameterEstimate]) -> ParameterEstimate:
-    spread = fit.spreads.get(name)
-    one = replace(_BLANK, unit=unit_of(name), kind="scatter", tests=tests, state="not determined")
-    if spread is None:
-        why = "too few tests determine it to estimate its common value"
-        return replace(one, value=fit.found.common[name][0], why=why)
-    sign = -1.0 if next(iter(tests.values())).value < 0.0 else 1.0
-    value, *ends = (sign * np.exp(np.minimum([spread.mean, *spread.ci95], LARGEST))).tolist()
-    ci95, limits = (min(ends), max(ends)), (-math.inf, math.inf)
-    state, why = covariance.state(name, value, covariance.wider(ci95, None), abs(value), limits)
-    determined = state != "not determined"
-    return replace(
-        one,
-        value=value,
-        stderr=abs(value) * spread.stderr if determined else None,
-        ci95=ci95 if determined else None,
-        state=state,
-        why=f"common value of {counted(spread.count, 'test')}: {why}",
-        scatter=spread.tau,
-        scatter_stderr=spread.tau_stderr,
-        scatter_ci95=spread.tau_ci95,
-    )
-
-
-def _judged(
-    fit: JointFit,
-    test: int,
-    name: str,
-    value: float,
-    error: tuple[float, float],
-    span: Ends | None = None,
-) -> ParameterEstimate:
-    """Judge a value by the wider of interval and range (`trust.covariance.RULE`).
-
-    `error` contains standard error and degrees of freedom; limits and scale are those of `test`.
+    Tests are sorted by rate if rates differ. At most `MOST_LOOPS` loops are drawn. `width` is "one"
+    or "two" columns, or a length such as "85 mm".
     """
-    problem, (stderr, freedom) = fit.found.problems[test], error
-    low, high = limits = fit.point.bests[test].limits(name)
-    size = float(problem.sizes((name,), fit.found.values[test])[0])
-    half = covariance.half_width(stderr, freedom)
-    ends = (value - half, value + half)
-    state, why = covariance.state(name, value, covariance.wider(ends, span), size, limits)
-    one = replace(_BLANK, value=value, unit=unit_of(name), state=state, why=why)
-    if not half <= covariance.NOTHING * size:
-        return one
-    return replace(one, stderr=stderr, ci95=(max(ends[0], low), min(ends[1], high)))
+    names = _in_order(found)
+    loops = {one.name: one for one in found.loops}
+    shown = [loops[test]._replace(name=name) for test, name in names.items() if test in loops]
+    kept = np.unique(np.linspace(0, max(len(shown) - 1, 0), MOST_LOOPS).astype(int))
+    panels = [
+        Panel(
+            name,
+            formula(own),
+            {names[t]: one.in_test(t) for t in names if one.tests and t in one.tests},
+            joint=one,
+        )
+        for own, (name, one) in zip(symbols(found.varied), found.varied.items(), strict=True)
+    ]
+    title = f"{found.name} · {found.model} · {len(names)} tests together"
+    above = partial(draw_loops, [shown[i] for i in kept[: len(shown)]]) if shown else None
+    return plot_parameters(title, list(names.values()), panels, width=width, above=above)
 
 
-def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, ParameterEstimate]:
-    """Return a parameter in each test that has it, with the zeros of the test's file."""
-    out, found = dict[str, ParameterEstimate](), fit.found
-    for t, (test, problem) in enumerate(zip(tests, found.problems, strict=True)):
-        if name not in problem.index or problem.is_exact(name):
-            continue
-        one = replace(_BLANK, value=float(found.values[t][problem.index[name]]), unit=unit_of(name))
-        branch = fit.point.bests[t].unreached.get(name)
-        if not problem.params[name].vary:
-            one = replace(one, vary=False, state="fixed", why="held fixed")
-        elif branch is not None and found.links.kind(name) == "own":
-            why = f"branch {branch} was never reached"
-            one = replace(one, state="not determined", why=why)
-        else:
-            one = _judged(fit, t, name, one.value, fit.point.of_test(t, name))
-        out[test] = one.counted_from(-problem.measurement.origins.get(name, 0.0))
-    return out
+def _in_order(found: JointResult) -> dict[str, str]:
+    """Return the displayed names of the tests; if rates differ, sorted by rate and with the rate.
 
-
-def _with_words(
-    result: JointResult, fit: JointFit, alone: Together, open_slopes: Mapping[str, float]
-) -> JointResult:
-    """Return a joint fit with its status, warnings and sentences."""
-    lost, large = dict[str, None](), list[str]()
-    for (test, one), best in zip(result.tests.items(), fit.point.bests, strict=True):
-        objective = best.problem.objective
-        for curve in objective.counted:
-            misfit, measured = one.misfit[curve], objective.measured[curve]
-            if misfit is None or not misfit <= UNACCEPTABLE * np.std(measured) / np.ptp(measured):
-                lost[test] = None
-            elif misfit > POOR:
-                large.append(f"{test} ({curve} {percent(misfit)})")
-    share, top = max((one.chi2_share, test) for test, one in result.tests.items())
-    evidence = list[tuple[str, str, str, float]]()  # parameter, best kind, its kind, gain in BIC
-    for chosen in (tried for tried in result.evidence if tried.chosen):
-        others = (tried for tried in result.evidence if tried.parameter == chosen.parameter)
-        first = min(others, key=lambda tried: tried.bic)
-        evidence.append((chosen.parameter, first.kind, chosen.kind, chosen.bic - first.bic))
-    rates = [rate for rate in result.rates if rate is not None]
-    shown = {
-        "parameters": list(result.parameters.items()),
-        "laws": RATES,
-        "rates": f"{min(rates):.3g} to {max(rates):.3g} 1/s" if rates else "",
-        "slopes": [
-            (name, result.parameters[name].kind, half) for name, half in open_slopes.items()
-        ],
-    }
-    warnings = render.sentences(
-        "joint_warnings",
-        refused=[(Path(file).name, why.rstrip(".")) for file, why in result.refused.items()],
-        lost=list(lost),
-        wrong=[
-            (test, one, best.problem.objective.drive)
-            for test, best in zip(result.tests, fit.point.bests, strict=True)
-            for one in unsettled(best, contradictions(best.problem.measurement))
-        ],
-        large=large,
-        top=(top, share) if len(result.tests) > 3 and share > DOMINANT else None,
-        gap=result.statistics["bic"] - result.statistics["bic_alone"],
-        together=_span_of(fit.found.misfits),
-        alone=_span_of(alone.misfits),
-        evidence=evidence,
-        **shown,
-    )
-    kinds = dict[str, list[str]]()
-    for name, parameter in result.parameters.items():
-        kinds.setdefault(str(parameter.kind), []).append(name)
-    sentences = render.sentences(
-        "joint_sentences",
-        tests=len(result.tests),
-        n_vary=fit.found.n_vary,
-        kinds=[f"{listed(names)} {kind}" for kind, names in kinds.items() if kind != "fixed"],
-        scatter=[
-            f"{name} {percent(one.scatter)} ({' to '.join(map(percent, one.scatter_ci95))})"
-            for name, one in result.parameters.items()
-            if one.scatter is not None and one.scatter_ci95 is not None
-        ],
-        **shown,
-    )
-    status = "failed" if lost else "warnings" if warnings else "ok"
-    return replace(result, status=status, warnings=warnings, sentences=sentences)
-
-
-def _span_of(found: Sequence[dict[str, float | None]]) -> Ends | None:
-    """Return smallest and largest misfit of some fits, of the loop or else of a time curve."""
-    names = ("stress_strain", "stress_time", "displacement_time")
-    each = (next((fit[n] for n in names if fit.get(n) is not None), None) for fit in found)
-    misfits = [misfit for misfit in each if misfit is not None]
-    return (min(misfits), max(misfits)) if misfits else None
+    Rates differ if a parameter follows a rate law, or by the factor `SEVERAL_RATES`.
+    """
+    known = [rate for rate in found.rates if rate]
+    least = 1.0 if any(one.kind in RATES for one in found.parameters.values()) else SEVERAL_RATES
+    all_known = least == 1.0 or len(known) == len(found.tests)
+    if found.rate0 is None or not all_known or max(known) <= least * min(known):
+        return {test: test for test in found.tests}
+    rates = dict(zip(found.tests, found.rates, strict=True))
+    tests = sorted(found.tests, key=lambda test: rates[test] or 0.0)
+    return {t: t if rates[t] is None else f"{t}, {rates[t]:.2g}/s" for t in tests}

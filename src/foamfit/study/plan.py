@@ -136,7 +136,7 @@ def plan(
     outcomes = [outcome(one, what) for one, what in zip(asked, seen, strict=True)]
     safe = [i for i, one in enumerate(outcomes) if one.breaks <= RISKY]
     now = _now(known, tests)
-    best = _advised(outcomes, safe, sum(one.chance for one in now.values())) if safe else None
+    best = _advised(outcomes, safe, sum(one.probability for one in now.values())) if safe else None
     pair = _pair(known, outcomes, seen, safe)
     progress(0.92, "what no test of this rig determines")
     shown = {name for i in safe for name in outcomes[i].determined}
@@ -327,7 +327,7 @@ def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
         one = fit.parameters[name]
         width = math.nan if one.ci95 is None else one.ci95[1] - one.ci95[0]
         share, chance = 0.5 * width / known.sizes[i], float(one.state == "determined")
-        out[name] = Expected(width, (width, width), float(share), one.state, chance)
+        out[name] = Expected(width, one.state, (width, width), chance, float(share))
     return out
 
 
@@ -367,7 +367,7 @@ def _pair(
 
     def number(pair: tuple[int, int]) -> float:
         both = [_thinned(seen[i]) for i in pair]
-        return sum(one.chance for one in expected(few, both).values())
+        return sum(one.probability for one in expected(few, both).values())
 
     return max(combinations(first, 2), key=number, default=None)
 

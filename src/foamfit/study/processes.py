@@ -126,26 +126,17 @@ class Processes(Executor):
         raise EndedError(f"its process ended {ATTEMPTS} times before it was done")
 
 
-def begin(jobs: int | None, count: int, few: int) -> None:
-    """Start importing the modules that `workers` needs with these arguments; see `prepare`."""
-    if _wanted(jobs, count, few) > 1:
-        prepare(_JOINT)
-
-
-def _wanted(jobs: int | None, count: int, few: int) -> int:
-    if jobs is not None:
-        check_whole("jobs", jobs, 1)
-    return 1 if count <= few else min(cores() if jobs is None else jobs, count)
-
-
 @contextmanager
 def workers(jobs: int | None, count: int, few: int) -> Iterator[Callable[..., Iterable[Any]]]:
     """Yield a `map` for `count` pieces of work in `jobs` processes (None: one per core).
 
     It is the built-in `map` for one job or up to `few` pieces of work, because starting a process
-    takes some seconds.
+    takes some seconds. The processes start at the first call, and their imports at once.
     """
-    if (wanted := _wanted(jobs, count, few)) < 2:
+    if jobs is not None:
+        check_whole("jobs", jobs, 1)
+    wanted = 1 if count <= few else min(cores() if jobs is None else jobs, count)
+    if wanted < 2:
         yield map
         return
     with Processes(wanted, _JOINT) as pool:

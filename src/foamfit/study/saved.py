@@ -16,13 +16,11 @@ from foamfit.arrays import Array
 from foamfit.codec import build, reading
 from foamfit.errors import InputError
 from foamfit.files import read_whole, reason
-from foamfit.report.folder import load_result
-from foamfit.report.samples import FILE as SAMPLES
-from foamfit.report.samples import read_samples
-from foamfit.report.studies.batch import read_table
-from foamfit.report.studies.cycles import CycleFits
+from foamfit.report.folder import SAMPLES, load_result, read_samples
+from foamfit.report.listing import read_table
 from foamfit.results import KEPT
 from foamfit.springs.model import Model
+from foamfit.study.cycles import CycleFits
 from foamfit.study.joint_result import JointResult
 from foamfit.trust.identifiability import Insight
 

@@ -33,17 +33,32 @@ _MARKS = {"determined": (BLUE, BLUE), "weak": (BLUE, "white"), "not determined":
 class Panel:
     """One parameter of several tests, and the values it is compared with.
 
-    `references` are other values by test, `common` is the value common to the tests, and `scatter`
-    the standard deviation of its logarithm between specimens.
+    `references` are other values by test, `joint` is the parameter in a joint fit of the tests.
     """
 
     name: str
     head: str  # symbol
     tests: dict[str, ParameterEstimate]
     references: dict[str, ParameterEstimate] = field(default_factory=dict)
-    kind: str = ""
-    common: ParameterEstimate | None = None
-    scatter: float | None = None
+    joint: ParameterEstimate | None = None
+
+    @property
+    def common(self) -> ParameterEstimate | None:
+        """The value common to all tests, if there is one."""
+        return self.joint if self.joint and self.joint.kind in ("shared", "scatter") else None
+
+    @property
+    def has_law(self) -> bool:
+        """Whether the parameter follows a rate law."""
+        return self.joint is not None and self.joint.kind in RATES
+
+    @property
+    def note(self) -> str:
+        """Kind of the parameter in a joint fit, and the slope of a rate law."""
+        if self.joint is None:
+            return ""
+        slope = "" if self.joint.b is None else f", b = {self.joint.b:.2g}".replace("-", "−")
+        return f"{self.joint.kind}{slope}"
 
 
 def panels_of(tests: Sequence[str], parameters: ByTest) -> list[Panel]:
@@ -119,7 +134,7 @@ def _draw(ax: Axes, panel: Panel, tests: Sequence[str], roomy: bool) -> None:
     ax.set_xlim(low, high)
     ax.set_title(f"{panel.head} ({unit})" if unit else panel.head, fontsize=7.5, pad=3)
     ax.set_label(panel.name)
-    ax.set_xlabel(panel.kind, fontsize=6.5, labelpad=1, color=GREY)
+    ax.set_xlabel(panel.note, fontsize=6.5, labelpad=1, color=GREY)
     ax.tick_params(axis="x", labelsize=5.5, length=2, pad=1.5)
     ax.locator_params(axis="x", nbins=2, steps=[1, 2, 5, 10])
     ticks = [tick for tick in ax.get_xticks() if low <= tick <= high]
@@ -132,7 +147,7 @@ def _draw(ax: Axes, panel: Panel, tests: Sequence[str], roomy: bool) -> None:
     if bars:
         y, left, right = np.array(bars).T
         ax.hlines(y, left / factor, right / factor, color=GREY, lw=0.9, label="95 % interval")
-    if panel.kind not in RATES:
+    if not panel.has_law:
         size = 3.4 if len(tests) <= 25 else 2.4 if len(tests) <= MOST_ROWS else 1.4
         _draw_values(ax, rows, factor, size)
     for artist in (*ax.lines, *ax.collections):
@@ -161,7 +176,7 @@ def _draw_others(ax: Axes, panel: Panel, tests: Sequence[str], factor: float) ->
     for y, test in enumerate(tests):
         if p := panel.references.get(test):
             ax.vlines(p.value / factor, y - 0.36, y + 0.36, label=p.state, **line)
-    if panel.kind in RATES:
+    if panel.has_law:
         rows = [row for row, test in enumerate(tests) if test in panel.tests]
         x = [panel.tests[tests[row]].value / factor for row in rows]
         ax.plot(x, rows, label="common", **line)
@@ -172,7 +187,8 @@ def _draw_others(ax: Axes, panel: Panel, tests: Sequence[str], factor: float) ->
             band: dict[str, Any] = {"color": VERMILION, "alpha": 0.18, "lw": 0, "zorder": 1}
             ends = (end / factor for end in panel.common.ci95)
             ax.axvspan(*ends, label="95 % interval of the common value", **band)
-        for sign in (-1.0, 1.0) if panel.scatter else ():
-            edge = value * float(np.exp(sign * (panel.scatter or 0.0)))
+        scatter = panel.common.scatter or 0.0
+        for sign in (-1.0, 1.0) if scatter else ():
+            edge = value * float(np.exp(sign * scatter))
             line |= {"ls": (0, (3, 2)), "lw": 0.8}
             ax.axvline(edge, label="spread between specimens", **line)

@@ -16,10 +16,12 @@ from foamfit.data.measurement import Measurement
 from foamfit.data.rig import Candidate, Rig
 from foamfit.parts import law_in_words
 from foamfit.report import figures
-from foamfit.report import folder as results
 from foamfit.report.figures import BLUE, GREY, TWO, VERMILION
+from foamfit.report.folder import write_json, write_text
 from foamfit.report.readable import own_name
 from foamfit.report.render import page, sentences, words
+from foamfit.report.result_figures import Mapped
+from foamfit.report.shown import Result, told
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import unit_of
 from foamfit.text import engineering
@@ -39,21 +41,21 @@ BEST = 12  # rows of the table of tests on the page
 class Expected:
     """What is expected of a parameter: 95 % interval and state.
 
-    `width` is the median width of the interval over the draws (SI; NaN where it is unknown), and
-    `ends` their 10 and 90 % quantiles. `share` is half of it over the scale of the parameter, and
-    `chance` the probability that the parameter is determined.
+    `ci95_width` is the median width of the interval over the draws (SI; NaN where it is unknown),
+    and `ci95_width_10_90` their 10 and 90 % quantiles. `share` is half of it over the scale of the
+    parameter, and `probability` that with which the parameter is determined.
     """
 
-    width: float
-    ends: tuple[float, float]
-    share: float
+    ci95_width: float
     state: str
-    chance: float
+    ci95_width_10_90: tuple[float, float]
+    probability: float
+    share: float
 
     def capped(self) -> Expected:
         """Return the same, but not determined."""
         state = "weak" if self.state == "determined" else self.state
-        return replace(self, state=state, chance=0.0)
+        return replace(self, state=state, probability=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +72,7 @@ class Outcome:
     @property
     def number(self) -> float:
         """Expected number of determined parameters."""
-        return sum(one.chance for one in self.expected.values())
+        return sum(one.probability for one in self.expected.values())
 
     @property
     def determined(self) -> list[str]:
@@ -90,7 +92,7 @@ class Outcome:
 
     def chance(self, names: Sequence[str]) -> float:
         """Return the least probability with which one of these parameters is determined."""
-        return min((self.expected[name].chance for name in names), default=1.0)
+        return min((self.expected[name].probability for name in names), default=1.0)
 
     @property
     def open(self) -> list[str]:
@@ -108,8 +110,8 @@ class Quantity:
     error: float
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+@dataclass(frozen=True, eq=False, repr=False)
+class Plan(Result):
     """The tests that a rig can make, ranked by what they would determine; SI."""
 
     tests: tuple[Measurement, ...]  #: the tests at hand
@@ -156,13 +158,11 @@ class Plan:
         """Return names of parameters, without the spring if there is only one."""
         return [own_name(name, self.model) for name in names]
 
-    def __repr__(self) -> str:
-        """Return the advice."""
-        return "\n  ".join((f"{self.name}: which test next?", *self.sentences))
+    _replaces = "plan.json"
 
-    def _repr_html_(self) -> str:
-        lines = "".join(f"<li>{line}</li>" for line in self.sentences)
-        return f"<p><b>{self.name}: which test next?</b></p><ul>{lines}</ul>"
+    def _shown(self, *, html: bool = False) -> str:
+        """Return the advice."""
+        return told(f"{self.name}: which test next?", self.sentences, html)
 
     def table(self) -> pd.DataFrame:
         """Return a row for each test: settings, risk, expected number and widths (SI)."""
@@ -175,7 +175,7 @@ class Plan:
             row |= {"breaks": one.breaks, "determined": one.number, "peak_force": one.force}
             row |= {"error": one.error} if self.quantity else {}
             row |= {f"told apart from {name}": x for name, x in one.apart.items()}
-            row |= {f"{name}_ci95_width": x.width for name, x in one.expected.items()}
+            row |= {f"{name}_ci95_width": x.ci95_width for name, x in one.expected.items()}
             rows.append(row | {f"{name}_state": x.state for name, x in one.expected.items()})
         return pd.DataFrame(rows)
 
@@ -198,13 +198,13 @@ class Plan:
             "seed": self.seed,
             "advice": best and _asked(best.candidate) | {
                 "determined": best.determined, "open": best.open, "breaks": best.breaks,
-                "expected": _shown(best.expected),
+                "expected": best.expected,
             },
-            "now": _shown(self.now),
+            "now": self.now,
             "candidates": [
                 _asked(one.candidate) | {
                     "breaks": one.breaks, "number_determined": one.number,
-                    "expected": _shown(one.expected), "peak_force": one.force,
+                    "expected": one.expected, "peak_force": one.force,
                     "quantity_error": one.error, "told_apart": one.apart,
                 }
                 for one in self.outcomes
@@ -221,35 +221,26 @@ class Plan:
         })  # fmt: skip
         return content
 
-    def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
-        """Write plan.json, plan.html, plan.png, plan.pdf, next.toml and joint.toml; return it.
+    def text(self, *, verbose: bool = False) -> str:
+        """Return the text that the command prints."""
+        return words("plan_terminal", plan=self)
 
-        A complete new plan replaces an older one. Without `report` there are no figure and no page.
-        """
-        figures.inches(figure_width)  # rejects an invalid width
-
-        def write(fresh: Path) -> None:
-            results.write_json(fresh / "plan.json", self.to_json_dict())
-            if self.advice is not None:
-                results.write_text(fresh / "next.toml", self.advice.candidate.toml(self.tests[0]))
-                results.write_text(fresh / "joint.toml", self._study(Path(folder)))
-            if report:
-                svg = figures.write_both(plot_plan(self, width=figure_width), fresh / "plan")
-                results.write_text(fresh / "plan.html", self._page(svg))
-
-        results.check_target(folder, of="plan.json")
-        return results.save_whole(folder, write)
-
-    def _study(self, folder: Path) -> str:
-        """Return joint.toml, the study of the tests at hand and the next one."""
-        files = [os.path.relpath(one.path, folder) for one in self.tests if one.path is not None]
-        values = {"files": [*files, "next.csv"], "read": Model.parse(self.model)}
-        return words("next_study", plan=self, folder=folder, **values) + "\n"
-
-    def _page(self, svg: bytes) -> str:
-        """Return plan.html."""
-        ranked = sorted(self.outcomes, key=lambda one: (one.risky, -one.number))
-        return page("plan", plan=self, svg=svg, best=ranked[:BEST], risky=RISKY, unit_of=unit_of)
+    def write(
+        self, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
+    ) -> None:
+        """Write plan.json, plan.html, plan.png, plan.pdf, next.toml and joint.toml."""
+        write_json(folder / "plan.json", self.to_json_dict())
+        if self.advice is not None:
+            write_text(folder / "next.toml", self.advice.candidate.toml(self.tests[0]))
+            # The folder will have a sibling's place, so relative paths remain valid.
+            paths = [os.path.relpath(one.path, folder) for one in self.tests if one.path]
+            values = {"files": [*paths, "next.csv"], "read": Model.parse(self.model)}
+            write_text(folder / "joint.toml", words("next_study", plan=self, **values) + "\n")
+        if pages:
+            ranked = sorted(self.outcomes, key=lambda one: (one.risky, -one.number))
+            shown: dict[str, Any] = {"plan": self, "best": ranked[:BEST], "risky": RISKY}
+            shown["svg"] = figures.write_both(plot_plan(self, width=width), folder / "plan")
+            write_text(folder / "plan.html", page("plan", unit_of=unit_of, **shown))
 
 
 SETTINGS = ("drive", "mass", "velocity", "strain", "rate", "cycles", "hold", "interior", "repeat")
@@ -260,24 +251,6 @@ def _asked(one: Candidate) -> dict[str, Any]:
     given = {key: getattr(one, key) for key in SETTINGS}
     given = {key: value for key, value in given.items() if value not in (None, False, 0.0)}
     return given if one.drive == "displacement" else given | {"cycles": 1}
-
-
-def _shown(expected: dict[str, Expected]) -> dict[str, dict[str, Any]]:
-    """Return expected intervals for plan.json."""
-    return {
-        name: {
-            "ci95_width": one.width,
-            "state": one.state,
-            "ci95_width_10_90": one.ends,
-            "probability": one.chance,
-        }
-        for name, one in expected.items()
-    }
-
-
-def plan_text(plan: Plan) -> str:
-    """Return the text that the command prints."""
-    return words("plan_terminal", plan=plan)
 
 
 def plot_plan(plan: Plan, *, width: str = TWO) -> Figure:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,19 +16,21 @@ from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
 from foamfit.parts import ParameterEstimate, law_in_words
 from foamfit.report import figures
-from foamfit.report import folder as results
-from foamfit.report.figures import BLUE, FITTED, INSIDE, SEEN, TWO, VERMILION
-from foamfit.report.readable import readable_unit
+from foamfit.report.figures import BLUE, INSIDE, TWO, VERMILION
+from foamfit.report.folder import write_columns, write_json
+from foamfit.report.panels import Line, Panel, measured
+from foamfit.report.plots import panelled
 from foamfit.report.render import words
+from foamfit.report.result_figures import Mapped
+from foamfit.report.shown import Result, told
+from foamfit.results import flags_of
 from foamfit.springs.model import Model
 from foamfit.text import percent
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 SCHEMA = 1
-PANEL = (2.6, 2.2)  # inches
 # Colour and dashes of each part of the band; the dashes distinguish them in greyscale.
 COLOURS: dict[str, tuple[str, Any]] = {
     "parameters": (BLUE, "-"),
@@ -37,8 +39,9 @@ COLOURS: dict[str, tuple[str, Any]] = {
     "motion": (VERMILION, (0, (1, 1.2))),
     "law_error": (INSIDE[0], (0, (5, 1.2, 1, 1.2))),
 }
-TOLD: Any = FITTED | {"label": "predicted"}
-BAND: Any = {"color": VERMILION, "alpha": 0.18, "linewidth": 0.0, "label": "95 % band"}
+# Labels and styles of curves.
+PREDICTED: tuple[str, dict[str, Any]] = ("predicted", {"color": VERMILION, "lw": 0.9, "zorder": 4})
+BAND: tuple[str, dict[str, Any]] = ("95 % band", {"color": VERMILION, "alpha": 0.18, "lw": 0.0})
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +93,8 @@ class PredictedCurve:
         return float(np.mean(self.parts[part][self.kept])) if part in self.parts else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
+@dataclass(frozen=True, eq=False, repr=False)
+class Prediction(Result):
     """Prediction, from a result, of a test that was not fitted; in SI."""
 
     source: str  #: Name of the result
@@ -118,29 +121,26 @@ class Prediction:
     #: from the origins of the file.
     aligned: dict[str, float] = field(default_factory=dict)
 
-    def __repr__(self) -> str:
+    _replaces = "prediction.json"  # a result of another kind may be its source
+
+    def _shown(self, *, html: bool = False) -> str:
         """Return the sentences on the prediction."""
-        head = f"{self.measurement.name} predicted from {self.source}"
-        return "\n  ".join((head, *self.sentences))
+        return told(f"{self.measurement.name} predicted from {self.source}", self.sentences, html)
 
-    def save(self, folder: str | Path, *, report: bool = True, figure_width: str = TWO) -> Path:
-        """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf``; return the folder.
+    def text(self, *, verbose: bool = False) -> str:
+        """Return the text that the command prints, with half widths relative to the range."""
+        every = self.curves.values()
+        parts = [part for part in COLOURS if any(part in one.parts for one in every)]
+        return words("prediction", found=self, parts=parts)
 
-        A complete new prediction replaces an older one. Without `report` there is no figure. Its
-        width is "one" or "two" columns or a length such as "85 mm".
-        """
-        figures.inches(figure_width)  # reject an invalid width
-
-        def write(fresh: Path) -> None:
-            results.write_json(fresh / "prediction.json", self.to_json_dict())
-            results.write_columns(fresh / "prediction.csv", self.columns)
-            if report:
-                figure = plot_prediction(self, width=figure_width)
-                figures.write_both(figure, fresh / "prediction")
-
-        # A result of another kind may be the source of this prediction.
-        results.check_target(folder, of="prediction.json")
-        return results.save_whole(folder, write)
+    def write(
+        self, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
+    ) -> None:
+        """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf`` into an existing folder."""
+        write_json(folder / "prediction.json", self.to_json_dict())
+        write_columns(folder / "prediction.csv", self.columns)
+        if pages:
+            figures.write_both(plot_prediction(self, width=width), folder / "prediction")
 
     @property
     def law(self) -> str:
@@ -165,36 +165,24 @@ class Prediction:
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``prediction.json``: SI, plain types, None for missing values."""
         m, model = self.measurement, Model.parse(self.model)
-        first = ["relaxation", "drive", "seed", "draws", "redrawn", "rate", "fitted_rates"]
-        first += ["extrapolated", "misfit", "inside", "by_cycle"]
-        last = ("parameters", "held", "aligned", "warnings", "sentences")
-        content: dict[str, Any] = plain(
-            {
-                "schema": SCHEMA,
-                "foamfit": version("foamfit"),
-                "test": m.name,
-                "data_sha256": m.data_sha256,
-                "cycle": m.cycle,
-                "last_cycle": m.last_cycle,
-                "result": self.source,
-                "joint": self.joint,
-                "model": model.words,
-                **model.options,
-                **{name: getattr(self, name) for name in first},
-                "curves": {
-                    name: {
-                        "range": curve.range,
-                        "half_width": curve.half_width,
-                        "half_widths": {part: curve.half_width_of(part) for part in curve.parts},
-                        "n": int(curve.kept.sum()),
-                        "unit": curve.unit,
-                    }
-                    for name, curve in self.curves.items()
-                },
-                **{name: getattr(self, name) for name in last},
+        renamed = ("source", "measurement", "model", "curves")
+        names = [one.name for one in fields(self) if one.name not in renamed]
+        names += ["inside", "by_cycle"]
+        curves = {
+            name: {
+                "range": curve.range,
+                "half_width": curve.half_width,
+                "half_widths": {part: curve.half_width_of(part) for part in curve.parts},
+                "n": int(curve.kept.sum()),
+                "unit": curve.unit,
             }
-        )
-        return content
+            for name, curve in self.curves.items()
+        }
+        content = {"schema": SCHEMA, "foamfit": version("foamfit"), "test": m.name}
+        content |= {name: getattr(m, name) for name in ("data_sha256", "cycle", "last_cycle")}
+        content |= {"result": self.source, "model": model.words, **model.options}
+        content |= {name: getattr(self, name) for name in names} | {"curves": curves}
+        return dict(plain(content))
 
     @property
     def columns(self) -> dict[str, Array]:
@@ -214,11 +202,7 @@ class Prediction:
             columns[f"{channel} band high ({unit})"] = curve.hi
             for part, width in curve.parts.items():
                 columns[f"{channel} half width, {part.replace('_', ' ')} ({unit})"] = width
-            outliers, sampled = m.outliers.get(channel), m.sampled.get(channel)
-            if outliers is not None and outliers.left_out.any():
-                columns[f"outliers of {channel} left out"] = outliers.left_out.astype(int)
-            if sampled is not None:
-                columns[f"{channel} is measured"] = sampled.astype(int)
+        columns |= flags_of(m)
         height = m.specimen.height
         if m.displacement is not None:
             columns["measured strain"] = m.displacement / height
@@ -227,82 +211,52 @@ class Prediction:
         return columns
 
 
-def prediction_text(found: Prediction) -> str:
-    """Return the text that the command prints, with half widths relative to the range."""
-    present = [part for part in COLOURS if any(part in one.parts for one in found.curves.values())]
-    return words("prediction", found=found, parts=present)
-
-
 def plot_prediction(found: Prediction, *, width: str = TWO) -> Figure:
-    """Draw the loop, each curve with its band, and the parts of the band.
+    """Draw the loop, and each curve with its band and the half width due to each part below.
 
-    Above are the loop and each curve over time, below the half width due to each part alone.
     `width` is "one" or "two" columns, or a length such as "85 mm"; panels that do not fit side by
     side are stacked.
     """
-    curves = list(found.curves.values())
-    wide = min(figures.inches(width), PANEL[0] * (1 + len(curves)))
-    across = figures.abreast(wide, 1 + len(curves))
-    bands = -(-(1 + len(curves)) // across)  # each has an upper and a lower row of panels
-    inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in curves)
-    title = figures.title(
-        width,
-        f"{found.measurement.name}, predicted from {found.source}; {words('rates', found=found)}",
-        f"inside the 95 % band: {inside}",
-    )
-    with figures.drawing(wide, bands * 1.7 * PANEL[1] + 0.1, *title) as figure:
-        grid = {"hspace": 0.06, "height_ratios": (1.0, 0.6) * bands}
-        axes = figure.subplots(2 * bands, across, squeeze=False, gridspec_kw=grid)
-        loop, *above = axes[::2].ravel()
-        key, *below = axes[1::2].ravel()
-        _loop(loop, found)
-        for upper, lower, curve in zip(above, below, curves, strict=False):
-            _in_time(upper, lower, found, curve)
-        for ax in (key, *above[len(curves) :], *below[len(curves) :]):
-            ax.set_axis_off()
-        entries = figures.named_in(figure.axes)
-        key.legend(entries.values(), entries, loc="upper left", fontsize=7, borderaxespad=0.0)
-        figure.align_ylabels()
-    return figure
+    inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in found.curves.values())
+    about = f"{found.measurement.name}, predicted from {found.source}"
+    title = f"{about}; {words('rates', found=found)}", f"inside the 95 % band: {inside}"
+    known = found.drive == "displacement"
+    with panelled(_panels(found), width, *title, strips=True, known=known) as (figure, _):
+        return figure
 
 
-def _loop(ax: Axes, found: Prediction) -> None:
-    """Draw the loop; with the band of the stress if the motion is prescribed."""
-    m, predicted = found.measurement, {c.channel: c for c in found.curves.values()}
-    stress, moved = predicted.get("stress"), predicted.get("displacement")
-    motion = m.displacement if moved is None else moved.predicted
-    if m.displacement is None or motion is None or m.stress is None:
-        figures.say_nothing_there(ax, "no motion")
-        return
-    height = m.specimen.height
-    factor, unit = readable_unit(float(np.max(m.stress)), "Pa")
-    ax.plot(m.displacement / height, m.stress / factor, **SEEN)
-    ax.plot(motion / height, (m.stress if stress is None else stress.predicted) / factor, **TOLD)
-    if stress is not None and moved is None:
+def _panels(found: Prediction) -> list[Panel]:
+    """Return the loop, with the band of the stress if the motion is prescribed, and each curve."""
+    m, told = found.measurement, {c.channel: c for c in found.curves.values()}
+    stress, moved = told.get("stress"), told.get("displacement")
+    motion, panels = m.displacement if moved is None else moved.predicted, list[Panel]()
+    if m.displacement is not None and motion is not None and m.stress is not None:
+        strain, height = motion / m.specimen.height, m.specimen.height
+        loop = measured(m.displacement / height, m.stress)
+        loop += [Line(strain, m.stress if stress is None else stress.predicted, *PREDICTED)]
         turn = int(np.argmax(motion))
-        for part in (slice(None, turn + 1), slice(turn, None)):
-            ends = stress.lo[part] / factor, stress.hi[part] / factor
-            ax.fill_between(motion[part] / height, *ends, **BAND)
-    ax.set(xlabel="strain", ylabel=f"stress ({unit})")
-
-
-def _in_time(above: Axes, below: Axes, found: Prediction, curve: PredictedCurve) -> None:
-    """Draw a curve with its band, and the half width of each part below."""
-    x, x_label = np.arange(curve.measured.size, dtype=float), "sample"
-    if (time := found.measurement.time) is not None:
-        scale, unit = readable_unit(float(np.nanmax(np.abs(time))), "s")
-        x, x_label = time / scale, f"time ({unit})"
-    factor, unit = readable_unit(float(np.max(np.abs(curve.measured))), curve.unit)
-    above.fill_between(x, curve.lo / factor, curve.hi / factor, **BAND)
-    above.plot(x, curve.measured / factor, **SEEN)
-    above.plot(x, curve.predicted / factor, **TOLD)
-    above.set(xlabel=x_label, ylabel=f"{curve.channel.replace('_', ' ')} ({unit})")
-    parts = {"all": (0.5 * (curve.hi - curve.lo), "black", ":")}
-    for part, look in COLOURS.items():
-        if part in curve.parts and np.any(curve.parts[part]):
-            parts[part.replace("_", " ")] = (curve.parts[part], *look)
-    for part, (half, colour, dashes) in parts.items():
-        style: Any = {"color": colour, "ls": dashes, "lw": 0.9, "label": f"half width: {part}"}
-        below.plot(x, half / factor, **style)
-    below.set_ylim(bottom=0.0)
-    below.set(xlabel=x_label, ylabel=f"half width ({unit})")
+        for way in (slice(None, turn + 1), slice(turn, None)):
+            if stress is not None and moved is None:
+                loop.append(Line(strain[way], stress.lo[way], *BAND, high=stress.hi[way]))
+        panels.append(Panel("stress-strain", "strain", "–", "stress", "Pa", loop))
+    for c in found.curves.values():
+        timed = ("time", "s") if m.time is not None else ("sample", "–")
+        x = np.arange(c.measured.size, dtype=float) if m.time is None else m.time
+        lines = [Line(x, c.lo, *BAND, high=c.hi), *measured(x, c.measured)]
+        lines += [Line(x, c.predicted, *PREDICTED)]
+        halves = {"all": (0.5 * (c.hi - c.lo), "black", ":")}
+        for part, look in COLOURS.items():
+            if part in c.parts and np.any(c.parts[part]):
+                halves[part.replace("_", " ")] = (c.parts[part], *look)
+        below = [
+            Line(
+                x,
+                100.0 * half / c.range,
+                f"half width: {part}",
+                {"color": colour, "ls": dashes, "lw": 0.9},
+            )
+            for part, (half, colour, dashes) in halves.items()
+        ]
+        name = c.channel.replace("_", " ")
+        panels.append(Panel(f"{name}-time", *timed, name, c.unit, lines, below, "half width"))
+    return panels
