@@ -175,8 +175,9 @@ def shown(name: str, one: Any, expected: Any) -> dict[str, Any]:
     width = math.nan if one.ci95 is None else one.ci95[1] - one.ci95[0]
     row = {"parameter": name, "value": one.value, "state": one.state, "width": width}
     if expected is not None:
+        low, high = expected.ci95_width_10_90
         row |= {"expected state": expected.state, "expected width": expected.ci95_width,
-                "low": expected.ci95_width_10_90[0], "high": expected.ci95_width_10_90[1]}  # fmt: skip
+                "low": low, "high": high}  # fmt: skip
     return row
 
 
