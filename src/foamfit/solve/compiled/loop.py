@@ -60,10 +60,11 @@ FADES = 5.0  # longest explicit step over a relaxation time; steps are stable up
 TRIED, BEYOND = 500, 4.0  # steps, and expected steps over their bound, that end a hopeless run
 STOPPED = 0.1  # most of the velocity that a first step takes
 # Results of a run; after them, for each derivative, whether it is one-sided.
-OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST, STRESS_LOST = range(
-    9
-)
-ENDINGS = 9
+(
+    OUTCOME, ENDED, STEPS, SWITCHES, FINITE, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST,
+    STRESS_LOST,
+) = range(10)  # fmt: skip
+ENDINGS = 10
 LEAST_SHARE = 1e-6  # of the largest scale of nodes, see `_fresh_scales`
 SWITCHED, RELEASED, STALLED = 1, 2, 3  # what happened in a step
 
@@ -308,16 +309,25 @@ def _failure(c, how, most, gives_up):  # type: ignore[no-untyped-def]
     return c.none + (STEP_UNDERFLOW if how == FAILED else DONE)
 
 
+@inner
+def _is_finite(c):  # type: ignore[no-untyped-def]
+    """Whether all samples of the response are finite."""
+    out, fine = c.out, c.none
+    for k in range(c.shown * c.samples):
+        fine += abs(out[k]) < math.inf
+    return fine == c.shown * c.samples
+
+
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
 def integrate(  # type: ignore[no-untyped-def]
-    template, ints, floats, rows, heights, mass, reals, values, time, out, log, endings
+    ints, floats, rows, heights, mass, reals, values, time, out, log, endings
 ):  # fmt: skip
     """Integrate a chain over sample times; fill `endings`.
 
     `out` (1 + p, 1 + nodes, n) becomes base stress and displacements, and their derivatives, `log`
     the switches; `ints` and `floats`, zeros, are the memory of the run.
     """
-    c = begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals)
+    c = begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals)
     r, want, struck = c.now, int(c.p > 0), int(reals[SPEED] > 0.0)
     tol, most, stalled, done = reals[TOL], reals[MOST], 0, 0
     _begin(c, reals, mass)
@@ -355,12 +365,9 @@ def integrate(  # type: ignore[no-untyped-def]
             _turn(c, want, -1 + c.none)
         r.step = dt
     endings[OUTCOME], endings[ENDED] = outcome, ended
-    endings[STEPS], endings[SWITCHES] = r.taken, r.logged
-    endings[STRONGEST], endings[FARTHEST], endings[DAMPED_OUT] = (
-        r.largest,
-        c.scales[OF_W],
-        r.damped,
-    )
+    endings[STEPS], endings[SWITCHES], endings[FINITE] = r.taken, r.logged, _is_finite(c)
+    endings[STRONGEST], endings[FARTHEST] = r.largest, c.scales[OF_W]
+    endings[DAMPED_OUT] = r.damped
     endings[MOTION_LOST], endings[STRESS_LOST] = c.worst[0], c.worst[1]
     for j in range(c.p):
         endings[ENDINGS + j] = c.sided[j]

@@ -112,10 +112,10 @@ DRIVE = (
 # risen, last error, next sample, number of the piece, switches; of implicit steps: length of the
 # one before, least length that the error can enforce, length of a short step, short steps in a row,
 # size of all vibrations that were damped out, and of those in the last steps; of explicit steps
-# along a drive: steps without an attempt at order 3.
+# along a drive: steps without an attempt at order 3; share of the step that the values belong to.
 NOW = (
     "now", "begun", "step", "horizon", "taken", "grow", "largest", "pressed", "last", "sample",
-    "piece", "logged", "before", "floor", "brief", "in_row", "damped", "damping", "paused",
+    "piece", "logged", "before", "floor", "brief", "in_row", "damped", "damping", "paused", "seen",
 )  # fmt: skip
 BATCH = 64  # samples that are computed together
 # Rows of the stages; the row with the rates at the end of a step; rows of the dense output.
@@ -200,17 +200,16 @@ def numbers(c, i):  # type: ignore[no-untyped-def]
 
 
 @inner
-def begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals):  # type: ignore[no-untyped-def]
+def begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals):  # type: ignore[no-untyped-def]
     """Fill the record of a run, set all springs at rest, and return the record.
 
-    `floats` are zeros. reals[0] is the onsite damping, reals[1] the pace of time.
+    `ints` are places instead of addresses, `floats` zeros. reals[0] is the onsite damping, reals[1]
+    the pace of time.
     """
     words = start(ints)
-    for k in range(template.size):
-        words[k] = template[k]
     for k in range(_INTEGERS_END):
         first = address(start(floats)) if k < _FLOATS_END else address(words)
-        words[k] = first + 8 * template[k]
+        words[k] = first + 8 * words[k]
     words[TIME], words[VALUES] = address(start(time)), address(start(values))
     words[OUT], words[LOG] = address(start(out)), address(start(log))
     words[SAMPLES], words[SHOWN], words[ROOM] = time.size, out.shape[1], log.shape[0]

@@ -246,13 +246,13 @@ def _write(c, k, now):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
 def balance(  # type: ignore[no-untyped-def]
-    template, ints, floats, rows, heights, mass, reals, values, time, out, log, history
+    ints, floats, rows, heights, mass, reals, values, time, out, log, history
 ):  # fmt: skip
     """Follow undamped, massless springs in series along a motion or stress of the top.
 
     `history` (2, springs, n) becomes strains and branches.
     """
-    c = begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals)
+    c = begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals)
     before = 0.0
     for i in range(c.count):
         evaluate(c, i, int(c.p > 0))
