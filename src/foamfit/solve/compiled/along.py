@@ -249,26 +249,29 @@ def follow(  # type: ignore[no-untyped-def]
     branch and slope dσ/dε, which are filled. Return whether the law needs another solver.
     """
     c = begin_run(ints, floats, time, strains, out, log, rows, heights, mass, reals)
-    s, t, tol, n, weight, m = c.springs, c.time, reals[3], c.samples, 0.0, c.batch
+    s, t, tol, n, weight, m = c.springs, c.time, start(reals)[3], c.samples, 0.0, c.batch
+    seed = start(samples)
     lasts = t[n - 1] - t[0]
     for k in range(c.terms):
         weight += s[RELAX + 2 * k] * min(1.0, lasts / s[RELAX + 2 * k + 1])
         m[2 + k * TABLE + OF_STEP] = -1.0
     bring_to(c, 0.0)
-    derive(c, start(samples))
+    derive(c, seed)
     if c.fade_at:
-        call_fade(c.fade_at, c, 0.0, 0.0, tol, start(samples), m)
+        call_fade(c.fade_at, c, 0.0, 0.0, tol, seed, m)
     for j in range(n):
-        seed, eps = past(start(samples), 4 * j), c.values[j]
+        eps = c.values[j]
         go_to(c, eps, t[j] - t[j - 1] if j > 0 else 0.0, m, seed, tol, weight)
         for k in range(c.terms if j == 0 else c.none):  # they carry nothing yet
             c.y[k] = -s.sigma
             for q in range(c.p):
                 c.y[c.base + k * c.p + q] = -c.common[q]
         sum_up(c, j)
-        samples[j, 2], samples[j, 3] = s.branch, s.slope
+        seed[2], seed[3] = s.branch, s.slope
         if not m[0] < math.inf:
             for k in range(j, n):
-                out[0, 0, k], samples[k, 2] = math.inf, s.branch
+                row_of(c, c.none, c.none)[k], seed[2] = math.inf, s.branch
+                seed = past(seed, 4)
             return m[1] < 0.0
+        seed = past(seed, 4)
     return False

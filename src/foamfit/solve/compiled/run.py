@@ -214,21 +214,28 @@ def begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals):
     words[OUT], words[LOG] = address(start(out)), address(start(log))
     words[SAMPLES], words[SHOWN], words[ROOM] = time.size, out.shape[1], log.shape[0]
     c = unpack(words)
-    terms, own = c.terms, rows.shape[1] - (c.width - c.row)  # first column of the laws
+    width, own = rows.shape[1], rows.shape[1] - (c.width - c.row)  # first column of the laws
+    given, tall, heavy, settings = start(rows), start(heights), start(mass), start(reals)
     for i in range(c.count):
-        s, n = spring(c, i), numbers(c, i)
-        s.height, s.per_height, s.eta, s.gain = heights[i], 1.0 / heights[i], rows[i, 0], 1.0
-        s.loss = s.eta
-        for k in range(terms):
-            s[RELAX + 2 * k], s[RELAX + 2 * k + 1] = rows[i, 1 + 2 * k], rows[i, 2 + 2 * k]
-            s.gain += rows[i, 1 + 2 * k]
+        s, n, height = spring(c, i), numbers(c, i), tall[i]
+        s.height, s.per_height, s.eta, s.loss, s.gain = (
+            height,
+            1.0 / height,
+            given[0],
+            given[0],
+            1.0,
+        )
+        for k in range(c.terms):
+            s[RELAX + 2 * k], s[RELAX + 2 * k + 1] = given[1 + 2 * k], given[2 + 2 * k]
+            s.gain += given[1 + 2 * k]
         row = past(s, c.row)
-        for k in range(own, rows.shape[1]):
-            row[k - own] = rows[i, k]
+        for k in range(own, width):
+            row[k - own] = given[k]
         call_begin(n.begin, row, s)
+        given = past(given, width)
     for g in range(c.groups):
-        c.per_mass[g] = 1.0 / mass[g]
-    c.drive.dragged, c.drive.pace = reals[0], reals[1]
+        c.per_mass[g] = 1.0 / heavy[g]
+    c.drive.dragged, c.drive.pace = settings[0], settings[1]
     for j in range(c.p):
         i, what = c.directions[2 * j], c.directions[2 * j + 1]
         if what == OWN_HEIGHT:
