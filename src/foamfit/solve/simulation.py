@@ -82,7 +82,7 @@ class Response:
 def _verified(
     scene: Plan, arrays: ChainArrays, rtol: float, directions: Directions = NO_DIRECTIONS
 ) -> Motion:
-    """Run a scene and, where its errors may grow, compare it with a run of shorter steps.
+    """Run a scene and, where its errors may grow, compare it with another run.
 
     Raise SimulationError if the error exceeds `rtol`.
     """

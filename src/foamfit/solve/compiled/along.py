@@ -14,19 +14,14 @@ import math
 from numba import njit
 
 from foamfit.solve.compiled.events import change_branch
-from foamfit.solve.compiled.motion import PART, call_inside, evaluate
+from foamfit.solve.compiled.motion import derive_spring, evaluate
 from foamfit.solve.compiled.run import RECORD, begin_run
 from foamfit.solve.compiled.samples import row_of
 from foamfit.springs.compiled.contract import (
-    BY,
-    BY_HELD,
-    BY_STRESS,
-    INTERNAL,
     OPTIONS,
     REAL,
     REALS_AT,
     RELAX,
-    RESULTS,
     WHOLE,
     WHOLES_AT,
     call_number,
@@ -35,7 +30,7 @@ from foamfit.springs.compiled.contract import (
     past,
     start,
 )
-from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
+from foamfit.springs.laws.record import MOVED, OWN_HEIGHT, OWN_RELAXATION
 
 OF_STEP, TABLE = 6, 8  # columns of the table of a relaxation term, which begins with moments
 LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the middle adds
@@ -60,20 +55,14 @@ def bring_to(c, eps):  # type: ignore[no-untyped-def]
 @inner
 def derive(c, seed):  # type: ignore[no-untyped-def]
     """Fill the derivatives of the stress now in `part`, and those of the strain."""
-    s, n, p = c.springs, c.numbers, c.p
-    out, held, part, strain = past(s, RESULTS), c.held, c.part, c.strain
-    if n.kind == INTERNAL:
-        call_inside(c, PART, c.none, c.none, c.y, c.y, c.y, part)
-    for j in range(p):
+    s, strain = c.springs, c.strain
+    derive_spring(c, c.none, c.y)
+    for j in range(c.p):
         own = c.directions[2 * j + 1]
         strain[j] = s.per_height * (seed[0] + seed[1] * s.eps) if own == MOVED else 0.0
         if own == OWN_HEIGHT:
             strain[j] = -s.eps * s.per_height
-        if n.kind != INTERNAL:
-            part[j] = out[BY + own] if 0 <= own < OWN_ETA else 0.0
-        if n.kind == BY_STRESS:
-            part[j] += out[BY_HELD] * held[j] + out[BY_HELD + 1] * held[p + j]
-        c.common[j] = part[j] + s.slope * strain[j]
+        c.common[j] = c.part[j] + s.slope * strain[j]
 
 
 @inner
