@@ -14,14 +14,19 @@ import math
 from numba import njit
 
 from foamfit.solve.compiled.events import change_branch
-from foamfit.solve.compiled.motion import derive_spring, evaluate
+from foamfit.solve.compiled.motion import PART, call_inside, evaluate
 from foamfit.solve.compiled.run import RECORD, begin_run
 from foamfit.solve.compiled.samples import row_of
 from foamfit.springs.compiled.contract import (
+    BY,
+    BY_HELD,
+    BY_STRESS,
+    INTERNAL,
     OPTIONS,
     REAL,
     REALS_AT,
     RELAX,
+    RESULTS,
     WHOLE,
     WHOLES_AT,
     call_number,
@@ -30,7 +35,7 @@ from foamfit.springs.compiled.contract import (
     past,
     start,
 )
-from foamfit.springs.laws.record import MOVED, OWN_HEIGHT, OWN_RELAXATION
+from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
 OF_STEP, TABLE = 6, 8  # columns of the table of a relaxation term, which begins with moments
 LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the middle adds
@@ -55,14 +60,20 @@ def bring_to(c, eps):  # type: ignore[no-untyped-def]
 @inner
 def derive(c, seed):  # type: ignore[no-untyped-def]
     """Fill the derivatives of the stress now in `part`, and those of the strain."""
-    s, strain = c.springs, c.strain
-    derive_spring(c, c.none, c.y)
-    for j in range(c.p):
+    s, n, p = c.springs, c.numbers, c.p
+    out, held, part, strain = past(s, RESULTS), c.held, c.part, c.strain
+    if n.kind == INTERNAL:
+        call_inside(c, PART, c.none, c.none, c.y, c.y, c.y, part)
+    for j in range(p):
         own = c.directions[2 * j + 1]
         strain[j] = s.per_height * (seed[0] + seed[1] * s.eps) if own == MOVED else 0.0
         if own == OWN_HEIGHT:
             strain[j] = -s.eps * s.per_height
-        c.common[j] = c.part[j] + s.slope * strain[j]
+        if n.kind != INTERNAL:
+            part[j] = out[BY + own] if 0 <= own < OWN_ETA else 0.0
+        if n.kind == BY_STRESS:
+            part[j] += out[BY_HELD] * held[j] + out[BY_HELD + 1] * held[p + j]
+        c.common[j] = part[j] + s.slope * strain[j]
 
 
 @inner
@@ -238,29 +249,26 @@ def follow(  # type: ignore[no-untyped-def]
     branch and slope dσ/dε, which are filled. Return whether the law needs another solver.
     """
     c = begin_run(ints, floats, time, strains, out, log, rows, heights, mass, reals)
-    s, t, tol, n, weight, m = c.springs, c.time, start(reals)[3], c.samples, 0.0, c.batch
-    seed = start(samples)
+    s, t, tol, n, weight, m = c.springs, c.time, reals[3], c.samples, 0.0, c.batch
     lasts = t[n - 1] - t[0]
     for k in range(c.terms):
         weight += s[RELAX + 2 * k] * min(1.0, lasts / s[RELAX + 2 * k + 1])
         m[2 + k * TABLE + OF_STEP] = -1.0
     bring_to(c, 0.0)
-    derive(c, seed)
+    derive(c, start(samples))
     if c.fade_at:
-        call_fade(c.fade_at, c, 0.0, 0.0, tol, seed, m)
+        call_fade(c.fade_at, c, 0.0, 0.0, tol, start(samples), m)
     for j in range(n):
-        eps = c.values[j]
+        seed, eps = past(start(samples), 4 * j), c.values[j]
         go_to(c, eps, t[j] - t[j - 1] if j > 0 else 0.0, m, seed, tol, weight)
         for k in range(c.terms if j == 0 else c.none):  # they carry nothing yet
             c.y[k] = -s.sigma
             for q in range(c.p):
                 c.y[c.base + k * c.p + q] = -c.common[q]
         sum_up(c, j)
-        seed[2], seed[3] = s.branch, s.slope
+        samples[j, 2], samples[j, 3] = s.branch, s.slope
         if not m[0] < math.inf:
             for k in range(j, n):
-                row_of(c, c.none, c.none)[k], seed[2] = math.inf, s.branch
-                seed = past(seed, 4)
+                out[0, 0, k], samples[k, 2] = math.inf, s.branch
             return m[1] < 0.0
-        seed = past(seed, 4)
     return False
