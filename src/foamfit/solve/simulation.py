@@ -102,15 +102,6 @@ def _verified(
     long = inside or motion.method == RADAU or _is_long(scene, motion, FEW_STEPS)
     if scene.speed > 0.0 and not long and not _hard(scene, arrays):
         return motion
-    return _checked(scene, arrays, motion, rtol, directions, inside, sharp)
-
-
-def _checked(
-    scene: Plan, arrays: ChainArrays, motion: Motion, rtol: float, directions: Directions,
-    inside: bool, sharp: bool,
-) -> Motion:  # fmt: skip
-    """Verify a motion; `inside` and `sharp` are two reasons why its errors may grow."""
-    rows, heights = arrays.rows, arrays.heights
 
     def run(scene: Plan, rtol: float) -> Motion:
         return scene.run(rows, heights, rtol, directions=directions)
