@@ -37,8 +37,7 @@ def _given(law: Law, row: Array, history: Array, top: int, out: Array) -> tuple[
         scales = 1e-3, 0.0, 1e-3, most
     reals = np.array((0.0, 0.0, 0.0 if integrated else TOL, TOL, 1e9, 0.0, 0.0, 0.0, *scales))
     time = np.arange(history.size, dtype=float)
-    memory = layout.words, np.empty_like(layout.words), np.zeros(layout.floats)
-    return [*memory, row[None, :], _ONE, _ONE, reals, history, time, out], integrated
+    return [*layout.memory(), row[None, :], _ONE, _ONE, reals, history, time, out], integrated
 
 
 def stress_along(law: Law, row: Array, strain: Array) -> tuple[Array, NDArray[np.int64]]:
@@ -56,9 +55,9 @@ def stress_along(law: Law, row: Array, strain: Array) -> tuple[Array, NDArray[np
     log, endings = np.empty((4 * strain.size + 64, 5)), np.empty(loop.ENDINGS)
     loop.integrate(*given, log, endings)
     for at, _, _, entered, _ in log[: int(endings[loop.SWITCHES])].tolist():
-        branches[int(np.searchsorted(given[8], at, "right")) :] = int(entered)
+        branches[int(np.searchsorted(given[7], at, "right")) :] = int(entered)
     if endings[loop.OUTCOME] != DONE:
-        out[0, 0, int(np.searchsorted(given[8], endings[loop.ENDED])) :] = np.inf
+        out[0, 0, int(np.searchsorted(given[7], endings[loop.ENDED])) :] = np.inf
     return out[0, 0], branches
 
 

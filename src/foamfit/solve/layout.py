@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from foamfit.arrays import Array
+from foamfit.solve import cache
 from foamfit.solve.compiled.run import (
     BATCH,
     DRIVE,
@@ -37,12 +39,18 @@ from foamfit.springs.compiled.contract import (
 )
 from foamfit.springs.laws.record import OWN_ETA, Law
 
+Memory = tuple[NDArray[np.int64], Array]  # the integers and floats of a run
+
 
 class Layout(NamedTuple):
     """Where everything of a run lies."""
 
     words: NDArray[np.int64]  #: integers of a run, with places instead of addresses
     floats: int  #: number of floats
+
+    def memory(self) -> Memory:
+        """Return the memory of a new run."""
+        return self.words.copy(), np.zeros(self.floats)
 
 
 class Shape(NamedTuple):
@@ -159,6 +167,7 @@ def _functions(
     if integrated:
         from foamfit.solve.compiled import loop, samples
 
+        cache.announce(loop.integrate, "the solver")
         advance, write = loop.ADVANCE, samples.WRITE
         if shape.degree:
             from foamfit.solve.compiled import implicit

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -14,12 +16,12 @@ from foamfit.solve import cache, histories
 from foamfit.solve import scene as scenes
 from foamfit.solve.compiled import along, loop, rates, static
 from foamfit.solve.compiled.run import AT, POINTS
-from foamfit.solve.layout import Layout, Shape, lay_out
+from foamfit.solve.layout import Layout, Memory, Shape, lay_out
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
 from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
-from foamfit.springs.compiled import compiled
+from foamfit.springs.compiled import compiled, slopes_of
 from foamfit.springs.compiled.contract import FLOWS, INTERNAL, STILL, TINY, Compiled
 from foamfit.springs.laws.record import MOVED, OWN_RELAXATION, Law
 from foamfit.springs.spring import as_samples
@@ -61,12 +63,15 @@ class Laws(NamedTuple):
 
     records: tuple[Law, ...]
     made: tuple[Compiled, ...]
-    loose: tuple[int, ...]  #: numbers of the unilateral springs
+    loose: tuple[int, ...] = ()  #: numbers of the unilateral springs
+    flowing: bool = False  #: whether one has internal variables
 
 
-def _laws(chain: Chain) -> Laws:
-    loose = tuple(i + 1 for i, law in enumerate(chain.laws) if law.kind == "unilateral")
-    return Laws(chain.laws, tuple(compiled(law) for law in chain.laws), loose)
+@lru_cache(maxsize=1024)
+def _laws(records: tuple[Law, ...]) -> Laws:
+    loose = tuple(i + 1 for i, law in enumerate(records) if law.kind == "unilateral")
+    made = tuple(compiled(law) for law in records)
+    return Laws(records, made, loose, any(one.kind == INTERNAL for one in made))
 
 
 class Plan(NamedTuple):
@@ -122,7 +127,7 @@ class Plan(NamedTuple):
                 return found
         drag = self.drag if drag is None else drag
         given = rows, heights, rtol, drag, directions, everything
-        motion = self._integrated(*given, LOGGED if everything else 0)
+        motion = self._integrated(*given)
         if everything and len(motion.switches) > LOGGED and motion.method != AGGREGATE:
             motion = self._integrated(*given, len(motion.switches))
         return motion
@@ -130,10 +135,11 @@ class Plan(NamedTuple):
     # ------------------------------------------------------------------ arrays of the solver
 
     def _layout(
-        self, rows: Array, directions: Directions, degree: int = 0, integrated: bool = True
-    ) -> Layout:
-        """Return where everything of a run lies."""
-        damped, terms = (rows[:, 0] > 0.0).tobytes(), self.terms
+        self, rows: Array, damped: bytes, directions: Directions, degree: int = 0,
+        integrated: bool = True,
+    ) -> Layout:  # fmt: skip
+        """Return where everything of a run lies; `damped` is whether each spring has a dashpot."""
+        terms = self.terms
         if terms and not rows[:, 1 : 1 + 2 * terms : 2].any():  # no strength: as without terms
             terms = terms if (directions[:, 1] >= OWN_RELAXATION).any() else 0
         solved = degree > 0 or not integrated
@@ -143,20 +149,14 @@ class Plan(NamedTuple):
         )  # fmt: skip
         return lay_out(shape, integrated)
 
-    def slopes_of(self, rows: Array) -> tuple[Array, Array]:
-        """Return the slopes dσ/dε (Pa) of the springs at rest, and the steepest at zero stress."""
-        at, first, steep = 1 + 2 * self.terms, [], []
-        for i, one in enumerate(self.laws.made):
-            found = [rows.item(i, at + column) for column in one.slopes] or [1.0]
-            first.append(found[0])
-            steep.append(max(found))
-        return np.array(first), np.array(steep)
+    def _slopes(self, rows: Array) -> Array:
+        return slopes_of(self.laws.made, rows[:, 1 + 2 * self.terms :])
 
     def _scales(self, rows: Array, heights: Array) -> tuple[float, float, float, float]:
         """Return least scales of displacement, velocity, strain and stress."""
         if self.speed > 0.0:
             return 0.0, self.speed, 0.0, 0.0
-        first, total = float(self.slopes_of(rows)[0].min()), float(heights.sum())
+        first, total = self._slopes(rows)[0].min(), heights.sum()
         most = float(np.abs(self.values).max())
         if self.top == scenes.MOTION:
             rate = np.abs(np.diff(self.values) / np.diff(self.time)).max(initial=0.0)
@@ -167,27 +167,25 @@ class Plan(NamedTuple):
 
     def _integrated(
         self, rows: Array, heights: Array, rtol: float, drag: float, directions: Directions,
-        everything: bool, logged: int,
+        everything: bool, logged: int = LOGGED,
     ) -> Motion:  # fmt: skip
         """Integrate in time and log the switches, if there is room."""
-        stiff = bool(self.implicit)
-        if self.implicit is None and (drag or len(self.ends) > 1 or any(rows[:, 0].tolist())):
+        stiff, damped = bool(self.implicit), (rows[:, 0] > 0.0).tobytes()
+        if self.implicit is None and (drag or len(self.ends) > 1 or 1 in damped):
             vibrates, relaxes = self.fastest_rates(rows, heights, drag)
             stiff = vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION
         shown = len(heights) if everything else 1
         out = np.empty((1 + len(directions), 1 + shown, self.time.size))
-        if (
-            not stiff
-            and not len(directions)
-            and (found := self._as_one(rows, heights, rtol, drag, out))
-        ):
-            return found
-        log, endings = np.empty((logged, 5)), np.empty(loop.ENDINGS + len(directions))
-        given = rows, heights, directions, out, log, endings
+        if len(heights) >= LEAST_AGGREGATE and not (stiff or len(directions)):
+            found = self._as_one(rows, heights, rtol, drag, out)
+            if found is not None:
+                return found
+        log = np.empty((logged if everything else 0, 5))
+        endings = np.empty(loop.ENDINGS + len(directions))
+        given = rows, heights, damped, directions, out, log, endings
         methods = self._methods(stiff)
         for degree in methods:
-            reals = self._reals(rows, heights, rtol, drag, degree)
-            reals[loop.FOLLOWED] = degree == 0 and methods[-1] > 0
+            reals = self._reals(rows, heights, rtol, drag, degree, methods[-1] > degree)
             self._integrate(*given, reals, degree)
             outcome = endings.item(loop.OUTCOME)
             if outcome not in _STIFF:
@@ -196,8 +194,7 @@ class Plan(NamedTuple):
             fastest = max(self.fastest_rates(rows, heights, drag))
             endings[loop.OUTCOME] = scenes.TOO_FAST if fastest > FASTEST else scenes.STEP_UNDERFLOW
         lost = loop.lost(endings) if degree else 0.0
-        method, strongest = RADAU if degree else EXPLICIT_STEPS, endings.item(loop.STRONGEST)
-        return self._motion(out, method, endings, log, rows, lost, strongest)
+        return self._motion(out, RADAU if degree else EXPLICIT_STEPS, endings, log, rows, lost)
 
     def _methods(self, stiff: bool) -> tuple[int, ...]:
         """Return the degrees of the methods to try: 0 for explicit steps.
@@ -212,7 +209,10 @@ class Plan(NamedTuple):
             return POINTS, 0
         return (0, POINTS) if self.max_explicit < self.max_steps else (0,)
 
-    def _reals(self, rows: Array, heights: Array, rtol: float, drag: float, degree: int) -> Array:
+    def _reals(
+        self, rows: Array, heights: Array, rtol: float, drag: float, degree: int = 0,
+        followed: bool = False,
+    ) -> Array:  # fmt: skip
         """Return the numbers that the loop over time is given; see `loop`."""
         least = LEAST_OF_MASSES if len(self.ends) > 1 else LEAST_TOL
         tol, most, brief = max(self.margin * rtol, least), self.max_steps, 0.0
@@ -226,31 +226,31 @@ class Plan(NamedTuple):
             most = self.max_explicit
         over = False
         if degree and self.speed > 0.0:
-            first = self.slopes_of(rows)[0]
+            first = self._slopes(rows)[0]
             over = rates.is_overdamped(first, rows[:, 0], heights, float(self.mass[-1]))
         scales = self._scales(rows, heights)
-        return np.array((drag, 1.0, self.speed, tol, most, brief, over, 0.0, *scales))
+        return np.array((drag, 1.0, self.speed, tol, most, brief, over, followed, *scales))
 
     def _integrate(
-        self, rows: Array, heights: Array, directions: Directions, out: Array, log: Array,
-        endings: Array, reals: Array, degree: int,
-    ) -> Array:  # fmt: skip
+        self, rows: Array, heights: Array, damped: bytes, directions: Directions, out: Array,
+        log: Array, endings: Array, reals: Array, degree: int = 0,
+    ) -> Memory:  # fmt: skip
         """Run the loop over time, with implicit steps if `degree` is that of their polynomial.
 
-        Return the row of the law of the first spring as the run has left it.
+        Return the memory as the run has left it.
         """
-        cache.announce(loop.integrate, "the solver")
-        layout = self._layout(rows, directions, degree)
-        memory, drive = _memory(layout), (self.mass, reals, self.values, self.time)
-        cache.timed(loop.integrate, *memory, rows, heights, *drive, out, log, endings)
-        return memory[2][layout.words[AT["row"]] :]
+        memory = self._layout(rows, damped, directions, degree).memory()
+        drive, began = (self.mass, reals, self.values, self.time), perf_counter()
+        loop.integrate(*memory, rows, heights, *drive, out, log, endings)
+        cache.SPENT.seconds += perf_counter() - began
+        return memory
 
     def _as_one(
         self, rows: Array, heights: Array, rtol: float, drag: float, out: Array
     ) -> Motion | None:
         """Treat many springs under one stress as one spring in an impact, if that is possible."""
-        count, one_stress = len(heights), len(self.ends) == 1 and not self.terms
-        if count < LEAST_AGGREGATE or not one_stress or self.speed == 0.0:
+        count = len(heights)
+        if len(self.ends) > 1 or self.terms or self.speed == 0.0:
             return None
         from foamfit.solve.compiled import aggregate  # which compiles it
 
@@ -258,40 +258,41 @@ class Plan(NamedTuple):
         if row is None:
             return None
         law, made = aggregate.law_of(count)
-        one = self._replace(laws=Laws((law,), (made,), ()), ends=(1,), implicit=False)
+        one = self._replace(laws=Laws((law,), (made,)), ends=(1,), implicit=False)
         row, height = np.concatenate(([0.0], row))[None], heights.sum(keepdims=True)
-        reals = one._reals(row, height, AS_ONE * rtol / count / self.margin, drag, 0)
+        reals = one._reals(row, height, AS_ONE * rtol / count / self.margin, drag)
         log, endings = np.empty((4 * count + 64, 5)), np.empty(loop.ENDINGS)
         whole = out if out.shape[1] == 2 else np.empty((1, 2, self.time.size))
-        memory = one._integrate(row, height, NO_DIRECTIONS, whole, log, endings, reals, 0)
+        words, memory = one._integrate(
+            row, height, b"\0", NO_DIRECTIONS, whole, log, endings, reals
+        )
+        memory = memory[words[AT["row"]] :]
         out[0, 0], out[0, -1] = whole[0, 0], whole[0, 1]
         if endings[loop.OUTCOME] == scenes.DONE:
             end = endings.item(loop.ENDED)
             log = aggregate.nodes_and_switches(memory, heights, log[:, 0], self.time, end, out)
             endings[loop.SWITCHES] = len(log)
-        strongest = endings.item(loop.STRONGEST)
-        return self._motion(out, AGGREGATE, endings, log, rows, 0.0, strongest)
+            endings[loop.FINITE] = np.isfinite(out[0]).all()
+        return self._motion(out, AGGREGATE, endings, log, rows, 0.0)
 
     def _brief(self, rows: Array, heights: Array, drag: float, tol: float) -> float:
         """Return the length of a short implicit step, s."""
         duration = self._duration
         if self.speed > 0.0:
-            first = self.slopes_of(rows)[0]
+            first = self._slopes(rows)[0]
             lasts = rates.contact_time(first, rows[:, 0], heights, float(self.mass[-1]), drag)
             duration = min(duration, 5.0 * lasts)
         short: float = SHORT * duration * (tol / 3e-8) ** (1.0 / 6.0)
         return short
 
     def _motion(
-        self, out: Array, method: str, endings: Array, log: Array, rows: Array, lost: float,
-        strongest: float = 0.0,
-    ) -> Motion:  # fmt: skip
+        self, out: Array, method: str, endings: Array, log: Array, rows: Array, lost: float
+    ) -> Motion:
         """Return the result of a run as a Motion; raise SimulationError if it failed."""
-        outcome, time, steps, switches = endings[:4].tolist()
-        loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
-        finite = outcome == scenes.DONE and bool(np.isfinite(out[0]).all())
-        if not finite:
+        outcome, time, steps, switches, finite, strongest = endings[: loop.FARTHEST].tolist()
+        if outcome != scenes.DONE or not finite:
             outcome = int(outcome) if outcome != scenes.DONE else scenes.NOT_FINITE
+            loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
             raise scenes.failure(outcome, self.top, self.values, loose, steps=int(steps), time=time)
         slopes = Slopes(out[1:, 1:], out[1:, 0], endings[loop.ENDINGS :]) if len(out) > 1 else None
         if len(log):
@@ -315,7 +316,9 @@ class Plan(NamedTuple):
         shown = count if everything else 1
         out = np.empty((1 + len(directions), 1 + shown, n))
         reals = np.array((0.0, 1.0, 0.0, rtol))
-        given = *_memory(self._layout(rows, directions, integrated=False)), rows, heights
+        damped = (rows[:, 0] > 0.0).tobytes()
+        memory = self._layout(rows, damped, directions, integrated=False).memory()
+        given = *memory, rows, heights
         if alone:
             own = directions[:, 1].tolist()
             strain = self.values / heights
@@ -353,7 +356,7 @@ class Plan(NamedTuple):
 
     def fastest_rates(self, rows: Array, heights: Array, drag: float) -> tuple[float, float]:
         """Return the radians of vibration and relaxation that explicit steps would cover."""
-        first, steep = self.slopes_of(rows)
+        first, steep = self._slopes(rows)
         gain = 1.0 + rows[:, 1 : 1 + 2 * self.terms : 2].sum(axis=1)
         eta = np.where(rows[:, 0] > TINY, rows[:, 0], 0.0)
         ends = np.array(self.ends)
@@ -361,17 +364,12 @@ class Plan(NamedTuple):
         return rates.fastest_rates(*chain, self.speed > 0.0, self._duration)
 
 
-def _memory(layout: Layout) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Return the words of a run, and memory for its integers and floats."""
-    return layout.words, np.empty_like(layout.words), np.zeros(layout.floats)
-
-
 def _time(t: ArrayLike) -> Array:
     time = as_samples(t, "t")  # a writable copy, for which the loops are compiled
     if time.ndim != 1 or time.size == 0:
         raise InputError("t must be a one-dimensional array with at least one sample")
     ends = math.isfinite(time.item(0)) and math.isfinite(time.item(-1))
-    if not (ends and (time[1:] > time[:-1]).all()):
+    if not ends or np.count_nonzero(time[1:] > time[:-1]) < time.size - 1:
         wrong = ~np.isfinite(time)
         wrong[1:] |= ~(time[1:] > time[:-1])
         at = int(wrong.argmax())
@@ -415,31 +413,25 @@ def plan(
             above, top = 0.0, scenes.MOTION
         elif above == 0.0:
             top = scenes.VISCOUS if chain.site_damping > 0.0 else scenes.STRESS
-    arrays, count, laws = chain.arrays, len(chain.springs), _laws(chain)
-    ends: tuple[int, ...] = (count,)
-    masses = np.array([above / chain.area])
-    if arrays.heavy:
-        inside = np.flatnonzero(arrays.masses[:-1] > 0.0)
-        ends = (*(inside + 1).tolist(), count)
-        masses = np.append(arrays.masses[inside] / chain.area, masses)
+    arrays, count, laws = chain.arrays, len(chain.springs), _laws(chain.laws)
+    masses, heavy = np.array((*arrays.inside, above / chain.area)), len(arrays.ends) > 1
     alone = top == scenes.MOTION and count == 1
-    flowing = any(one.kind == INTERNAL for one in laws.made)
-    internal = flowing and not (alone and laws.made[0].flows < FLOWS)
+    internal = laws.flowing and not (alone and laws.made[0].flows < FLOWS)
     damped = dashpots or arrays.damped or top == scenes.VISCOUS or internal
-    if arrays.heavy or above > 0.0:
+    if heavy or above > 0.0:
         solver = SECOND_ORDER
     elif ((damped or relaxing or chain.relaxes) and not alone) or internal:
         solver = FIRST_ORDER
     else:
         solver = CLOSED_FORM
-    margin = OF_MASSES if arrays.heavy else IN_SERIES if count > 1 else ALONE
+    margin = OF_MASSES if heavy else IN_SERIES if count > 1 else ALONE
     most = MOST_WORK // count + 2 * time.size + 8 * count
     most = max(1, min(max_steps, most, MOST_SAMPLED // count))
     explicit = min(most, 20 * time.size + max(1000, MOST_EXPLICIT_WORK // count))
-    if flowing:  # whose own rates no estimate knows; implicit steps are tried after a few
+    if laws.flowing:  # whose own rates no estimate knows; implicit steps are tried after a few
         explicit = min(explicit, most // 4)
     drag, terms = chain.site_damping / chain.height, max(chain.relaxation)
     return Plan(
-        solver, laws, terms, chain.height, ends, masses, drag, top, values, time, speed, margin,
-        most, explicit,
+        solver, laws, terms, chain.height, arrays.ends, masses, drag, top, values, time, speed,
+        margin, most, explicit,
     )  # fmt: skip

@@ -49,15 +49,17 @@ class ChainArrays(NamedTuple):
     """A chain in the form that the solver uses.
 
     rows (n_springs, columns) are the springs (`compiled.solver_row`), padded with zeros; heights
-    (m) and masses (kg) are (n_springs,). `heavy` is whether there are interior masses, `damped`
-    whether there are dashpots.
+    (m) are (n_springs,). `ends` are one past the last spring below each interior mass and the top,
+    `inside` the interior masses over the area (kg/m²), `damped` whether there are dashpots,
+    `steep` the sum of the heights times the steepest slopes at zero stress (Pa·m).
     """
 
     rows: Array
     heights: Array
-    masses: Array
-    heavy: bool
+    ends: tuple[int, ...]
+    inside: tuple[float, ...]
     damped: bool
+    steep: float
 
 
 @dataclass(frozen=True, init=False)
@@ -145,13 +147,19 @@ class Chain:
     @cached_property
     def arrays(self) -> ChainArrays:
         """The chain in the form that the solver uses."""
+        from foamfit.springs.compiled import compiled, slopes_of
+
         room = max(self.relaxation)
+        rows = padded([one.solver_row(room) for one in self.springs])
+        steep = slopes_of([compiled(law) for law in self.laws], rows[:, 1 + 2 * room :])[1]
+        heavy = [i for i, mass in enumerate(self.masses[:-1]) if mass > 0.0]
         return ChainArrays(
-            rows=padded([one.solver_row(room) for one in self.springs]),
+            rows=rows,
             heights=np.array(self.heights),
-            masses=np.array(self.masses),
-            heavy=any(mass > 0.0 for mass in self.masses[:-1]),
+            ends=(*(i + 1 for i in heavy), len(self.springs)),
+            inside=tuple(self.masses[i] / self.area for i in heavy),
             damped=any(spring.eta > 0.0 for spring in self.springs),
+            steep=float(steep @ np.array(self.heights)),
         )
 
 

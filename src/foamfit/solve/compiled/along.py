@@ -241,14 +241,14 @@ def go_to(c, eps, between, m, seed, tol, weight):  # type: ignore[no-untyped-def
 
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
 def follow(  # type: ignore[no-untyped-def]
-    template, ints, floats, rows, heights, mass, reals, strains, time, out, log, samples
+    ints, floats, rows, heights, mass, reals, strains, time, out, log, samples
 ):  # fmt: skip
     """Follow one spring, without its dashpot, along strains from rest.
 
     `samples` (n, 4) are derivatives by a shift of the motion, see `histories.at_samples`, then
     branch and slope dσ/dε, which are filled. Return whether the law needs another solver.
     """
-    c = begin_run(template, ints, floats, time, strains, out, log, rows, heights, mass, reals)
+    c = begin_run(ints, floats, time, strains, out, log, rows, heights, mass, reals)
     s, t, tol, n, weight, m = c.springs, c.time, reals[3], c.samples, 0.0, c.batch
     lasts = t[n - 1] - t[0]
     for k in range(c.terms):

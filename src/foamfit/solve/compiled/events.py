@@ -290,7 +290,7 @@ def _turned(c, i, x):  # type: ignore[no-untyped-def]
             low, f_low, middle, least = middle, least, x, value
         else:
             low, f_low = x, value
-        x = _vertex(low, f_low, middle, least, high, f_high)[0]
+        x, _ = _vertex(low, f_low, middle, least, high, f_high)
         if not low < x < high or abs(x - middle) < 1e-3:
             break
     return NOWHERE

@@ -69,7 +69,8 @@ WEIGHT = np.concatenate(
 TIMES = pair.C[:ALL_STAGES]
 MIDWAY_STAGE = int(np.flatnonzero(TIMES == MIDDLE)[0])
 
-LAST_TERM = 1e-3  # share of the last term of the dense output that counts as its error
+LAST_TERM = 3e-4  # share of the last term of the dense output that counts as its error
+AIMED = 0.77  # growth of a step whose dense output has an error of 1; few steps are then repeated
 
 
 @inner
@@ -195,11 +196,11 @@ def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
         size = make_dense(c, n, dt, at, tol, want)
         if size > 1.0 and dt > 1e-12 * abs(r.horizon):
             again = True
-            r.step = dt * max(0.3, 0.9 * size**-0.143)
+            r.step = dt * max(0.3, AIMED * size**-0.143)
             continue
         r.last = max(error, 1e-4)
         if size > 0.0:
-            r.grow = min(r.grow, 0.9 * size**-0.143)
+            r.grow = min(r.grow, AIMED * size**-0.143)
         return DOUBTFUL if doubtful else SAMPLED
 
 

@@ -48,6 +48,7 @@ from foamfit.springs.compiled.contract import (
     inlined,
     inner,
     past,
+    start,
 )
 
 # Numbers that a run is given, after onsite damping and pace: velocity of a striker, tolerance,
@@ -60,10 +61,11 @@ FADES = 5.0  # longest explicit step over a relaxation time; steps are stable up
 TRIED, BEYOND = 500, 4.0  # steps, and expected steps over their bound, that end a hopeless run
 STOPPED = 0.1  # most of the velocity that a first step takes
 # Results of a run; after them, for each derivative, whether it is one-sided.
-OUTCOME, ENDED, STEPS, SWITCHES, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST, STRESS_LOST = range(
-    9
-)
-ENDINGS = 9
+(
+    OUTCOME, ENDED, STEPS, SWITCHES, FINITE, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST,
+    STRESS_LOST,
+) = range(10)  # fmt: skip
+ENDINGS = 10
 LEAST_SHARE = 1e-6  # of the largest scale of nodes, see `_fresh_scales`
 SWITCHED, RELEASED, STALLED = 1, 2, 3  # what happened in a step
 
@@ -243,7 +245,7 @@ def _longest(c, want):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _begin(c, reals, mass):  # type: ignore[no-untyped-def]
+def _begin(c, reals):  # type: ignore[no-untyped-def]
     """Set scales and, for an impact, the striker."""
     r, top = c.now, c.groups - 1
     for k in range(SCALES):
@@ -253,7 +255,7 @@ def _begin(c, reals, mass):  # type: ignore[no-untyped-def]
     r.brief, r.last, r.grow, c.drive.overdamped = reals[BRIEFLY], 1e-4, 1.0, reals[OVER]
     if reals[SPEED] > 0.0:
         c.y[2 * top + 1] = reals[SPEED]
-        c.drive.value, c.drive.gravity = c.values[0], c.values[0] / mass[top]
+        c.drive.value, c.drive.gravity = c.values[0], c.values[0] * c.per_mass[top]
         r.horizon = max(c.time[c.samples - 1], 1e-30)  # a sample at contact needs a step
         approach(c, reals[SPEED])
 
@@ -308,19 +310,29 @@ def _failure(c, how, most, gives_up):  # type: ignore[no-untyped-def]
     return c.none + (STEP_UNDERFLOW if how == FAILED else DONE)
 
 
+@inner
+def _is_finite(c):  # type: ignore[no-untyped-def]
+    """Whether all samples of the response are finite."""
+    out, fine = c.out, c.none
+    for k in range(c.shown * c.samples):
+        fine += abs(out[k]) < math.inf
+    return fine == c.shown * c.samples
+
+
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
 def integrate(  # type: ignore[no-untyped-def]
-    template, ints, floats, rows, heights, mass, reals, values, time, out, log, endings
+    ints, floats, rows, heights, mass, reals, values, time, out, log, endings
 ):  # fmt: skip
     """Integrate a chain over sample times; fill `endings`.
 
     `out` (1 + p, 1 + nodes, n) becomes base stress and displacements, and their derivatives, `log`
     the switches; `ints` and `floats`, zeros, are the memory of the run.
     """
-    c = begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals)
-    r, want, struck = c.now, int(c.p > 0), int(reals[SPEED] > 0.0)
-    tol, most, stalled, done = reals[TOL], reals[MOST], 0, 0
-    _begin(c, reals, mass)
+    c = begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals)
+    given, told = start(reals), start(endings)
+    r, want, struck = c.now, int(c.p > 0), int(given[SPEED] > 0.0)
+    tol, most, stalled, done = given[TOL], given[MOST], 0, 0
+    _begin(c, given)
     if struck:
         rates(c, c.y, c.stage, want, 0.0)
         short = FIRST * r.brief
@@ -332,7 +344,7 @@ def integrate(  # type: ignore[no-untyped-def]
         done = drive(c, 1, want)
         r.step = r.horizon
     outcome, ended, longest = DONE, math.nan, _longest(c, want)
-    gives_up = reals[FOLLOWED] > 0.0 and not struck
+    gives_up = given[FOLLOWED] > 0.0 and not struck
     while not (done or (struck and int(r.sample) == c.samples)):
         _fresh_scales(c)
         keep_values(c)
@@ -354,16 +366,13 @@ def integrate(  # type: ignore[no-untyped-def]
             done = drive(c, c.none, want)
             _turn(c, want, -1 + c.none)
         r.step = dt
-    endings[OUTCOME], endings[ENDED] = outcome, ended
-    endings[STEPS], endings[SWITCHES] = r.taken, r.logged
-    endings[STRONGEST], endings[FARTHEST], endings[DAMPED_OUT] = (
-        r.largest,
-        c.scales[OF_W],
-        r.damped,
-    )
-    endings[MOTION_LOST], endings[STRESS_LOST] = c.worst[0], c.worst[1]
+    told[OUTCOME], told[ENDED] = outcome, ended
+    told[STEPS], told[SWITCHES], told[FINITE] = r.taken, r.logged, _is_finite(c)
+    told[STRONGEST], told[FARTHEST] = r.largest, c.scales[OF_W]
+    told[DAMPED_OUT] = r.damped
+    told[MOTION_LOST], told[STRESS_LOST] = c.worst[0], c.worst[1]
     for j in range(c.p):
-        endings[ENDINGS + j] = c.sided[j]
+        told[ENDINGS + j] = c.sided[j]
 
 
 def lost(endings: Array) -> float:

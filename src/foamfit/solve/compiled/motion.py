@@ -8,6 +8,8 @@ chain").
 
 from __future__ import annotations
 
+import math
+
 from numba import cfunc, types
 
 from foamfit.solve.compiled.run import RECORD, numbers, spring, unpack
@@ -302,6 +304,9 @@ def _rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
     """Fill the rates f of a state y, or only the values of one group, or those in a step."""
     c = unpack(words)
     share = at
+    if only == IN_STEP and share == c.now.seen:
+        return
+    c.now.seen = share if only == IN_STEP else math.inf
     if only == IN_STEP:
         dense(c, c.base, share, y)
         at = c.now.now + share * c.now.step

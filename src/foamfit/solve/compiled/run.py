@@ -112,10 +112,10 @@ DRIVE = (
 # risen, last error, next sample, number of the piece, switches; of implicit steps: length of the
 # one before, least length that the error can enforce, length of a short step, short steps in a row,
 # size of all vibrations that were damped out, and of those in the last steps; of explicit steps
-# along a drive: steps without an attempt at order 3.
+# along a drive: steps without an attempt at order 3; share of the step that the values belong to.
 NOW = (
     "now", "begun", "step", "horizon", "taken", "grow", "largest", "pressed", "last", "sample",
-    "piece", "logged", "before", "floor", "brief", "in_row", "damped", "damping", "paused",
+    "piece", "logged", "before", "floor", "brief", "in_row", "damped", "damping", "paused", "seen",
 )  # fmt: skip
 BATCH = 64  # samples that are computed together
 # Rows of the stages; the row with the rates at the end of a step; rows of the dense output.
@@ -200,36 +200,42 @@ def numbers(c, i):  # type: ignore[no-untyped-def]
 
 
 @inner
-def begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals):  # type: ignore[no-untyped-def]
+def begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals):  # type: ignore[no-untyped-def]
     """Fill the record of a run, set all springs at rest, and return the record.
 
-    `floats` are zeros. reals[0] is the onsite damping, reals[1] the pace of time.
+    `ints` are places instead of addresses, `floats` zeros. reals[0] is the onsite damping, reals[1]
+    the pace of time.
     """
     words = start(ints)
-    for k in range(template.size):
-        words[k] = template[k]
     for k in range(_INTEGERS_END):
         first = address(start(floats)) if k < _FLOATS_END else address(words)
-        words[k] = first + 8 * template[k]
+        words[k] = first + 8 * words[k]
     words[TIME], words[VALUES] = address(start(time)), address(start(values))
     words[OUT], words[LOG] = address(start(out)), address(start(log))
     words[SAMPLES], words[SHOWN], words[ROOM] = time.size, out.shape[1], log.shape[0]
     c = unpack(words)
-    terms, own = c.terms, rows.shape[1] - (c.width - c.row)  # first column of the laws
+    width, own = rows.shape[1], rows.shape[1] - (c.width - c.row)  # first column of the laws
+    given, tall, heavy, settings = start(rows), start(heights), start(mass), start(reals)
     for i in range(c.count):
-        s, n = spring(c, i), numbers(c, i)
-        s.height, s.per_height, s.eta, s.gain = heights[i], 1.0 / heights[i], rows[i, 0], 1.0
-        s.loss = s.eta
-        for k in range(terms):
-            s[RELAX + 2 * k], s[RELAX + 2 * k + 1] = rows[i, 1 + 2 * k], rows[i, 2 + 2 * k]
-            s.gain += rows[i, 1 + 2 * k]
+        s, n, height = spring(c, i), numbers(c, i), tall[i]
+        s.height, s.per_height, s.eta, s.loss, s.gain = (
+            height,
+            1.0 / height,
+            given[0],
+            given[0],
+            1.0,
+        )
+        for k in range(c.terms):
+            s[RELAX + 2 * k], s[RELAX + 2 * k + 1] = given[1 + 2 * k], given[2 + 2 * k]
+            s.gain += given[1 + 2 * k]
         row = past(s, c.row)
-        for k in range(own, rows.shape[1]):
-            row[k - own] = rows[i, k]
+        for k in range(own, width):
+            row[k - own] = given[k]
         call_begin(n.begin, row, s)
+        given = past(given, width)
     for g in range(c.groups):
-        c.per_mass[g] = 1.0 / mass[g]
-    c.drive.dragged, c.drive.pace = reals[0], reals[1]
+        c.per_mass[g] = 1.0 / heavy[g]
+    c.drive.dragged, c.drive.pace = settings[0], settings[1]
     for j in range(c.p):
         i, what = c.directions[2 * j], c.directions[2 * j + 1]
         if what == OWN_HEIGHT:

@@ -116,7 +116,6 @@ def _write_batch(c, at, n):  # type: ignore[no-untyped-def]
     for k in range(n):
         shares[k] = (time[at + k] - now) / dt
     polynomial(c, c.none, n, w)
-    polynomial(c, c.none + 1, n, v)
     for k in range(n):
         eps[k] = w[k] * per
     if own.x_at >= 0:
@@ -124,7 +123,11 @@ def _write_batch(c, at, n):  # type: ignore[no-untyped-def]
     call_evaluate(own.evaluate, past(s, c.row), s, eps, x, n, int(c.p > 0), found)
     sigma, stress = past(found, OF_LAW * n), past(row_of(c, c.none, c.none), at)
     for k in range(n):
-        stress[k] = gain * sigma[k] + eta * per * v[k]
+        stress[k] = gain * sigma[k]
+    if eta > 0.0:
+        polynomial(c, c.none + 1, n, v)
+        for k in range(n):
+            stress[k] += eta * per * v[k]
     for q in range(c.terms):
         polynomial(c, own.z_at + q, n, work)
         for k in range(n):

@@ -59,7 +59,8 @@ def elongation_at(c, i0, i1, sigma, loose):  # type: ignore[no-untyped-def]
 @inner
 def _split_jump(c, i0, i1, target, low, high, loose):  # type: ignore[no-untyped-def]
     """Distribute an elongation inside a jump between two stresses from the base up."""
-    rest = target - elongation_at(c, i0, i1, low, loose)[0]
+    reached, _, _ = elongation_at(c, i0, i1, low, loose)
+    rest = target - reached
     for i in range(i0, i1):
         s = spring(c, i)
         if loose and s.eta > 0.0:
@@ -192,8 +193,8 @@ def bring(c, i0, i1, target, common, y):  # type: ignore[no-untyped-def]
             limit = min(limit, s.sigma_high) if up else max(limit, s.sigma_low)
         limit = max(limit, common) if up else min(limit, common)
         if abs(limit) < math.inf:
-            beyond = target - elongation_at(c, i0, i1, limit, c.none)[0]
-            if (beyond > 0.0) if up else (beyond < 0.0):
+            reached, _, _ = elongation_at(c, i0, i1, limit, c.none)
+            if (target > reached) if up else (target < reached):
                 common = limit
                 for i in range(i0, i1):
                     put(c, i, strain_at(c, i, limit), limit)
@@ -246,13 +247,13 @@ def _write(c, k, now):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
 def balance(  # type: ignore[no-untyped-def]
-    template, ints, floats, rows, heights, mass, reals, values, time, out, log, history
+    ints, floats, rows, heights, mass, reals, values, time, out, log, history
 ):  # fmt: skip
     """Follow undamped, massless springs in series along a motion or stress of the top.
 
     `history` (2, springs, n) becomes strains and branches.
     """
-    c = begin_run(template, ints, floats, time, values, out, log, rows, heights, mass, reals)
+    c = begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals)
     before = 0.0
     for i in range(c.count):
         evaluate(c, i, int(c.p > 0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,15 @@ def compiled(law: Law) -> Compiled:
     from foamfit.springs.compiled.registered import compile_law
 
     return compile_law(law)
+
+
+def slopes_of(laws: Sequence[Compiled], rows: Array) -> Array:
+    """Return slopes dσ/dε (Pa) at zero stress of springs with these rows of their laws, (2, n).
+
+    The first is that at rest, the second that of the steepest branch.
+    """
+    found = [[rows.item(i, column) for column in one.slopes] or [1.0] for i, one in enumerate(laws)]
+    return np.array([[one[0] for one in found], [max(one) for one in found]])
 
 
 def row_of(law: Law, values: ArrayLike) -> Array | None:

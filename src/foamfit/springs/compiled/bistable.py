@@ -20,6 +20,7 @@ from foamfit.springs.compiled.contract import (
     inverting,
     past,
     settling,
+    start,
     switching,
 )
 from foamfit.springs.law import admissible, derived_points
@@ -36,8 +37,9 @@ _admissible, _derived_points = inner(admissible), inner(derived_points)
 
 
 @njit(**OPTIONS, cache=True)
-def fill(values, row):  # type: ignore[no-untyped-def]
+def fill(given, array):  # type: ignore[no-untyped-def]
     """Write the row of the seven parameters."""
+    values, row = start(given), start(array)
     k0, kc, dsigma, eps_a = values[0], values[1], values[2], values[3]
     eps_c, plus, minus = values[4], values[5], values[6]
     if not _admissible(k0, kc, dsigma, eps_a, eps_c, plus, minus):
@@ -91,10 +93,11 @@ def evaluate(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
             r = eps[j] - origin
             sigma[j], slope[j], factor[j] = offset + k * r, k, r
     if want:
-        for j in range(count):
-            for c in range(7):
-                by = line[3 + c] * factor[j] - line[10 + c] * slope[j] + line[17 + c]
-                out[(BY + c) * count + j] = by
+        for c in range(7):
+            by, of_k = past(out, (BY + c) * count), line[3 + c]
+            of_x0, of_s0 = line[10 + c], line[17 + c]
+            for j in range(count):
+                by[j] = of_k * factor[j] - of_x0 * slope[j] + of_s0
     return 0.0
 
 

@@ -95,7 +95,8 @@ def fill(values, array):  # type: ignore[no-untyped-def]
     row.worn, row.log_again = row.k0 * math.exp(-softening), row.log_plus - weakening
     row.remembers = 1.0 if count > 7 else 0.0
     row.cross = _crossing(row.log_again, row.plus, row.log_minus, row.minus)
-    return row.worn > 0.0 and row.star >= _most_beyond(row.worn, row.kc, n)[0]
+    least, _ = _most_beyond(row.worn, row.kc, n)
+    return row.worn > 0.0 and row.star >= least
 
 
 # ---------------------------------------------------------------- from branch to branch
@@ -208,7 +209,7 @@ def _turn(row, s, up, out):  # type: ignore[no-untyped-def]
     """Hold the rank that a spring has reached where its strain turns."""
     branch, remembers, rank = s.branch, row.remembers > 0.0, rank_now(row, s)
     first = 5 if branch == BACK else 3
-    scale = line(row, int(branch))[1]
+    _, scale = line(row, int(branch))
     for h in range(2 if branch == SNAP and remembers else 1):
         by = past(out, h * CHANGE)
         by[OF_HELD + h], by[OF_STRESS] = 0.0, 1.0 / (scale * s.x)
@@ -217,7 +218,8 @@ def _turn(row, s, up, out):  # type: ignore[no-untyped-def]
         if branch == AGAIN:
             by[OF_PARAMETER + WEAKENING] = 1.0 / scale
     if branch == SNAP and remembers:
-        s.ever, s.never = rank, shares(rank)[1]
+        s.ever = rank
+        _, s.never = shares(rank)
     _hold(row, s, rank)
     if not up and row.log_again == row.log_plus and not _has_loop(row, s.x, False):
         _enter(row, s, BOTH)
