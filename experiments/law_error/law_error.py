@@ -63,7 +63,8 @@ def branches(width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     def rounded(stress: np.ndarray) -> np.ndarray:
         longer = np.pad(stress, half, mode="reflect", reflect_type="odd")
-        return np.convolve(longer, window / window.sum(), "valid")
+        smooth = np.convolve(longer, window / window.sum(), "valid")
+        return smooth - smooth[0]  # exactly zero, where contact ends
 
     return strain, rounded(up), rounded(down)
 

@@ -12,8 +12,9 @@ from scipy.signal import lfilter
 import rig
 from foamfit.data.csv_file import read_test
 from foamfit.data.energy import audit
-from foamfit.data.measurement import Record, Specimen, Striker
+from foamfit.data.measurement import NoiseLevel, Record, Specimen, Striker
 from foamfit.data.prepare import condition
+from foamfit.data.zeros import tail_level
 from foamfit.errors import InputError
 from foamfit.fitting.problem import make_params
 
@@ -150,6 +151,22 @@ def test_zeros_have_the_error_of_their_mean():
     for name, found in errors.items():
         assert np.std(found) == pytest.approx(np.median(told[name]), rel=0.35)
         assert abs(np.mean(found)) < 0.6 * np.median(told[name])
+
+
+@pytest.mark.parametrize("soft", [True, False])
+def test_a_soft_end_of_contact_is_not_the_offset_of_the_sensor(soft):
+    """The record ends with the contact; the stress last falls from 3 % of its peak, slowly."""
+    fall = np.linspace(1.0, 0.0, 30) if soft else np.full(30, 0.5)
+    clean = np.concatenate([np.sin(np.linspace(0.0, 3.1, 470)), 0.03 * fall])
+    sigma, rng = 0.005, np.random.default_rng(4)
+    known = NoiseLevel(sigma, False, "known")
+    found = [tail_level(clean + sigma * rng.standard_normal(500), known) for _ in range(60)]
+    taken = [level for level in found if level is not None]
+    if soft:
+        assert len(taken) <= 3
+        return
+    assert len(taken) >= 57
+    assert np.abs([level.value - 0.015 for level in taken]).max() < 4.0 * sigma / np.sqrt(20)
 
 
 def test_a_rest_that_drifts_owns_up_to_it():

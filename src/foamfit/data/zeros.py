@@ -9,7 +9,16 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.contact import ELSEWHERE, Levels, Start
 from foamfit.data.measurement import GRAVITY, NoiseLevel, Record, Striker
-from foamfit.data.noise import MIN_REST, NOTHING, Level, level_on_line, line_at, mean_level, smooth
+from foamfit.data.noise import (
+    MIN_REST,
+    NOTHING,
+    Level,
+    level_on_line,
+    line_at,
+    mean_level,
+    noise_about,
+    smooth,
+)
 from foamfit.text import engineering, percent
 
 _LEAST_LEAD = 8  # least number of rows kept before contact
@@ -70,8 +79,7 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
     if np.argmax(values) > len(values) - 2 * size:
         return None
     level = mean_level(values[-n:], noise)
-    halves = values[-n : -n // 2].mean() - values[-n // 2 :].mean()
-    if abs(halves) > 3.0 * 2.0 * level.error:
+    if _falls(values[-n:], level):
         return None
     while n + step < len(values) // 2:
         more = mean_level(values[-n - step : -n], noise)
@@ -84,6 +92,18 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
     if level.samples < MIN_REST:
         level = level._replace(error=max(level.error, noise.sigma))
     return level if abs(level.value) < _HIGHEST * float(np.ptp(values)) else None
+
+
+def _falls(tail: Array, level: Level) -> bool:
+    """Return whether the end of a record still changes: its halves differ significantly.
+
+    The scatter is that about a line: a mean takes the fall of a soft end of contact for scatter.
+    """
+    n, error = tail.size, level.error
+    if n >= MIN_REST:
+        scatter, time = noise_about(tail, 1)
+        error = scatter * float(np.sqrt(time / n))
+    return bool(abs(tail[: n // 2].mean() - tail[n // 2 :].mean()) > 3.0 * 2.0 * error)
 
 
 def take_zeros(
