@@ -137,7 +137,8 @@ def recorded(
     """Return seconds and lowest cost of a search: at each clear improvement and at its end.
 
     The search ends after `budget` seconds of processor time, or near the best `known` cost. Only
-    evaluations of the measurement of `objective` count as progress.
+    evaluations of the residual of `objective` count as progress, not those of a thinned record or
+    of one weighed by the uncertainty of its motion.
     """
     plain, derivative = Objective.residual, Objective.jacobian
     rows, lowest, began = list[tuple[float, float]](), np.inf, time.process_time()
@@ -151,7 +152,7 @@ def recorded(
     def residual(self: Objective, values: Array) -> Array:
         nonlocal lowest
         out, seconds = plain(self, values), elapsed()
-        if self.measurement is objective.measurement:
+        if self.measurement is objective.measurement and self.weighing is None:
             lowest, last = min(lowest, float(out @ out)), rows[-1][1] if rows else np.inf
             if lowest < RECORDED * last or lowest <= SOLVED * known < last:
                 rows.append((seconds, lowest))
@@ -281,7 +282,7 @@ def best_known(case: Case, problem: Problem) -> float:
             problem.measurement, model=case.model, drive=case.drive, seed=seed, starts=96,
             intervals="local",
         )  # fmt: skip
-        residual = problem.objective.residual(problem.vector(result.params))
+        residual = problem.objective.residual(result.problem.vector())  # without the file's zeros
         costs.append(float(residual @ residual))
     return min(costs)
 
