@@ -102,14 +102,6 @@ def test_help_shows_an_example(args: list[str]) -> None:
         assert re.search(r"\n {6}foamfit (fit|check) \S+\.csv", text)
 
 
-def test_without_a_command_it_shows_its_help() -> None:
-    assert accepted().stdout == accepted("--help").stdout
-
-
-def test_version() -> None:
-    assert re.fullmatch(r"foamfit \d+\.\d+\.\d+\S*\n", accepted("--version").stdout)
-
-
 def test_check_with_another_specimen(here: Path) -> None:
     path = write(here, toml=None)
     (here / "other.toml").write_text('name = "another"\n' + SPECIMEN)

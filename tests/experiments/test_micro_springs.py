@@ -11,7 +11,3 @@ def test_micro_springs_converge_to_the_law_as_their_number() -> None:
     table = [(n, *microscale.errors(n)) for n in (10, 100)]
     assert microscale.rate(table, 1) == pytest.approx(-1.0, abs=0.02)
     assert table[0][1] == pytest.approx(0.0131, rel=0.01)
-
-
-def test_inner_loops_close() -> None:
-    assert max(microscale.returns(n) for n in (None, 2, 7, 50)) < 1e-15
