@@ -79,10 +79,8 @@ class Row:
     @property
     def report(self) -> str:
         """The name of its report; "" if none was written."""
-        found = [
-            n for n in ("report.html", "joint.html") if self.place and (self.place / n).is_file()
-        ]
-        return found[0] if found else ""
+        names = ("report.html", "joint.html")
+        return next((name for name in names if (self.place / name).is_file()), "")
 
     @property
     def counts(self) -> tuple[int, int]:

@@ -55,7 +55,7 @@ class Source:
         return self.table.headers[self.columns[channel]].measure(channel)
 
     def entry(self, channel: str) -> Entry:
-        """Return the entry of [columns] for a channel, without a column if there is none."""
+        """Return the entry of [columns] for a channel, or an empty one if the TOML has none."""
         return self.given.get(channel, Entry(channel))
 
     def only(self, channels: Iterable[str]) -> Source:

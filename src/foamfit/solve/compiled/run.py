@@ -218,13 +218,8 @@ def begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals):
     given, tall, heavy, settings = start(rows), start(heights), start(mass), start(reals)
     for i in range(c.count):
         s, n, height = spring(c, i), numbers(c, i), tall[i]
-        s.height, s.per_height, s.eta, s.loss, s.gain = (
-            height,
-            1.0 / height,
-            given[0],
-            given[0],
-            1.0,
-        )
+        s.height, s.per_height, s.gain = height, 1.0 / height, 1.0
+        s.eta, s.loss = given[0], given[0]
         for k in range(c.terms):
             s[RELAX + 2 * k], s[RELAX + 2 * k + 1] = given[1 + 2 * k], given[2 + 2 * k]
             s.gain += given[1 + 2 * k]

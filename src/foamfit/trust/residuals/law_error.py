@@ -166,10 +166,10 @@ def curve_errors(
     `FAST` on top of white noise. Model error adds a peak at low frequencies to white or first-order
     noise. The Bayesian information criterion decides between the two; among 1200 records of white
     and first-order noise (autocorrelations up to 0.95, 120 to 5000 samples) it found model error in
-    one. A noise that would scatter about local cubics more than `ROUGHER` times as much as the
-    residual does is none: that residual contains model error too. If the test is `driven` by a
-    stress, all is taken as noise: noise of the stress passes through the springs as slow waves of
-    the displacement, which look like model error.
+    one. A process that scatters about local cubics more than `ROUGHER` times as much as the
+    residual cannot be its noise; such a residual also contains model error. If the test is `driven`
+    by a stress, all is taken as noise: noise of the stress passes through the springs as slow waves
+    of the displacement, which look like model error.
     """
     basis = basis_of(jacobian) if taken is None else taken
     own = noise_processes(residual, jacobian, sizes, taken)
@@ -198,10 +198,8 @@ def _curve_error(residual: Array, basis: Array, own: NoiseProcess) -> CurveError
     evidence = alone.criterion - with_law.criterion
     weights, kept = residual_filter(LOCAL)
     local = np.convolve(residual, weights, "valid")
-    least, most = (
-        robust_variance(local) ** 0.5 / SMOOTHER,
-        ROUGHER * float(np.mean(local**2)) ** 0.5,
-    )
+    least = math.sqrt(robust_variance(local)) / SMOOTHER
+    most = ROUGHER * math.sqrt(float(np.mean(local**2)))
     process = _within(_process(seen, with_law), kept, least, most)
     size = math.sqrt(max(float(residual @ residual) / n - process.variance, 0.0))
     if size < SMALLEST or (evidence <= 0.0 and own.scatter(kept) <= most):
