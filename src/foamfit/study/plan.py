@@ -53,7 +53,9 @@ Progress = Callable[[float, str], None]
 DRAWS = 40  # number of drawn foams
 TRIES = 60  # attempts per draw
 NEARLY = 0.1  # tests that determine this many parameters fewer, on average, count as equal
-PAIRED = 40  # number of tests whose pairs are compared
+# What a softer test may lose: parameters, on average, and this share of the width of intervals.
+FEWER, WIDER = 0.5, 0.05
+PAIRED = 20  # number of tests whose pairs are compared
 TOLD_APART = 9.0  # rise of χ² at which a test tells two laws apart
 HALVINGS = 12  # of the interval in which the closing velocity is sought
 
@@ -337,25 +339,30 @@ def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
 def _advised(outcomes: Sequence[Outcome], safe: Sequence[int], now: float) -> int:
     """Return the place of the advised test among those that are `safe`.
 
-    Of the tests that determine most parameters it is the one with the least error of the quantity
-    asked for, or else the softest, or if none determines more than `now` the one with the narrowest
-    intervals; of tests with rivals one that tells them apart.
+    It is the softest of those that determine most parameters with the narrowest intervals, or with
+    a quantity asked for the one with its least error; if none determines more than `now`, it is the
+    one with the narrowest intervals. With rivals it tells them apart, if a test can.
     """
-    most = max(outcomes[i].number for i in safe)
-    good = [i for i in safe if outcomes[i].number >= most - NEARLY]
-    told = [i for i in good if all(x >= TOLD_APART for x in outcomes[i].apart.values())]
-    if not told:
-        return max(good, key=lambda i: min(outcomes[i].apart.values()))
-    if outcomes[told[0]].error is not None:
-        return min(told, key=lambda i: outcomes[i].error or 0.0)
+
+    def least_apart(i: int) -> float:
+        return min(outcomes[i].apart.values(), default=math.inf)
 
     def effort(i: int) -> tuple[bool, float, int, float]:
         asked = outcomes[i].candidate
         return asked.interior is not None, asked.hold, asked.cycles, outcomes[i].force
 
+    most = max(outcomes[i].number for i in safe)
+    good = [i for i in safe if outcomes[i].number >= most - NEARLY]
+    told = [i for i in good if least_apart(i) >= TOLD_APART]
+    if not told:
+        return max(good, key=least_apart)
+    if outcomes[told[0]].error is not None:
+        return min(told, key=lambda i: outcomes[i].error or 0.0)
     if most <= now + NEARLY:
         return min(told, key=lambda i: outcomes[i].narrowness)
-    return min(told, key=effort)
+    near = [i for i in safe if outcomes[i].number >= most - FEWER and least_apart(i) >= TOLD_APART]
+    least = min(outcomes[i].narrowness for i in near)
+    return min((i for i in near if outcomes[i].narrowness <= least + WIDER), key=effort)
 
 
 def _pair(
@@ -363,21 +370,12 @@ def _pair(
 ) -> tuple[int, int] | None:
     """Return the places of the two safe tests that determine most together."""
     first = sorted(safe, key=lambda i: -outcomes[i].number)[:PAIRED]
-    few = replace(known, draws=known.draws[::2])
 
     def number(pair: tuple[int, int]) -> float:
-        both = [_thinned(seen[i]) for i in pair]
-        return sum(one.probability for one in expected(few, both).values())
+        found = expected(known, [seen[i] for i in pair])
+        return sum(one.probability for one in found.values())
 
     return max(combinations(first, 2), key=number, default=None)
-
-
-def _thinned(seen: Seen) -> Seen:
-    """Return every other draw."""
-    return replace(
-        seen, bread=seen.bread[::2], meat=seen.meat[::2], reached=seen.reached[::2],
-        broken=seen.broken[::2], missed=seen.missed[::2],
-    )  # fmt: skip
 
 
 def _beyond(known: Known, left: Sequence[str], rig: Rig, *, impacts: bool) -> dict[str, str]:
