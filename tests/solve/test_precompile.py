@@ -30,12 +30,12 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-from numba.core.ccallback import CFunc
 from numba.core.dispatcher import Dispatcher
 
 import foamfit as ff
 from conftest import synthetic_loop
 from foamfit.solve import precompile
+from foamfit.springs.compiled.contract import Pointed
 
 
 def compiled():
@@ -45,8 +45,8 @@ def compiled():
         if isinstance(value, Dispatcher):
             name = f"{value.py_func.__module__}.{value.py_func.__name__}"
             found |= {f"{name} {signature}" for signature in value.signatures}
-        elif isinstance(value, CFunc):
-            found.add(f"{value.__wrapped__.__module__}.{value.__name__}")
+        elif isinstance(value, Pointed) and "compiled" in vars(value):
+            found.add(f"{value.function.__module__}.{value.function.__name__}")
     return found
 
 
@@ -74,7 +74,7 @@ def keep_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(("path", "model"), [(str(RECONSTRUCTION), "bistable"), ("", "microscale")])
 def test_a_fit_calls_what_was_compiled_and_nothing_else(path: str, model: str) -> None:
-    """Neither a function nor a signature of one is new; modules compile theirs when imported."""
+    """Neither a function nor a signature of one is new."""
     done = subprocess.run(
         [sys.executable, "-c", FIT, path, model],
         env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
@@ -91,6 +91,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Return what was run, in order, with an empty cache."""
     done: list[Any] = []
     monkeypatch.setattr(precompile, "run", lambda *given: done.append(given))
+    monkeypatch.setattr(precompile, "SECOND", "")
     monkeypatch.setattr(cache, "compiled", lambda *_: False)
     return done
 
@@ -106,7 +107,7 @@ def test_the_first_use_says_that_it_compiles(
         told = run("fit", RECONSTRUCTION, "--out", out)
         assert told.exit_code == 0, told.output
         assert ("compiling the solver" in told.stderr) == (not ready)
-    assert asked == [("integrate", "bistable"), ("follow", "bistable")]
+    assert list(dict.fromkeys(asked)) == [("follow", "bistable"), ("integrate", "bistable")]
 
 
 def test_a_spring_does_not_load_what_was_compiled_of_another_source(tmp_path: Path) -> None:
@@ -152,7 +153,7 @@ def test_every_module_with_compiled_loops_is_known() -> None:
     written = {
         path.relative_to(stale.PACKAGE)
         for path in stale.PACKAGE.rglob("*.py")
-        if re.search(r"\b(njit|cfunc)\b|^@(inner|inlined|outer)$", path.read_text(), re.M)
+        if re.search(r"\b(njit|cfunc)\b|^@(inner|inlined|outer|pointed)\b", path.read_text(), re.M)
     }
     assert set(stale.FOLDERS) == {path.parts[0] for path in written}
     stored = {stale.PACKAGE / path.parent / "__pycache__" for path in written}

@@ -147,7 +147,7 @@ def _functions(
 ) -> tuple[int, ...]:
     """Return the addresses of the functions that a run needs, 0 for others (see run.ADDRESSES).
 
-    A function is compiled when its module is first imported.
+    A function is compiled when its address is first asked for.
     """
     from foamfit.solve.compiled import events, motion
 
@@ -155,33 +155,34 @@ def _functions(
     if several:
         from foamfit.solve.compiled import groups
 
-        group = groups.GROUP_AT
+        group = groups.group_values.address
     if internal:
         from foamfit.solve.compiled import internal as inner
 
-        inside = inner.INSIDE_AT
+        inside = inner.inside_task.address
     if fades:
         from foamfit.solve.compiled import decay
 
-        fade = decay.FADE
+        fade = decay.fade.address
     if integrated:
         from foamfit.solve.compiled import loop, samples
 
         cache.announce(loop.integrate, "the solver")
-        advance, write = loop.ADVANCE, samples.WRITE
+        advance, write = loop.advance.address, samples.sample_task.address
         if shape.degree:
             from foamfit.solve.compiled import implicit
 
-            step = implicit.IMPLICIT_STEP
+            step = implicit.step.address
         else:
             from foamfit.solve.compiled import explicit
 
-            step = explicit.EXPLICIT_STEP
+            step = explicit.step.address
     if integrated and not shape.struck:
         from foamfit.solve.compiled import drive as driven
 
-        drive, short = driven.DRIVE, driven.SHORT_STEP
-    return motion.RATES, group, inside, events.CHANGE, step, advance, drive, write, fade, short
+        drive, short = driven.next_piece.address, driven.short_step.address
+    rates, change = motion.compute_rates.address, events.enter_branch.address
+    return rates, group, inside, change, step, advance, drive, write, fade, short
 
 
 def _memory_of_decay(one: Compiled, p: int) -> int:

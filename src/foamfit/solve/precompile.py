@@ -1,22 +1,25 @@
 """Compilation at first use, into numba's cache, before a fit begins.
 
-Nothing depends on this module: a loop missing from the cache is compiled, and announced, where it
-is first needed. Both loops share the compiled laws, so a second process would save little time and
-compile them twice.
+Nothing depends on this module: a function missing from the cache is compiled, and announced, where
+it is first needed. A second process compiles half of the solver.
 """
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
-from contextlib import suppress
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 import numpy as np
 
 from foamfit.errors import SimulationError
 from foamfit.solve import cache
 
-LOOPS = ("integrate", "follow")
+LOOPS = ("follow", "integrate")  # `integrate` needs what the second process compiles
+SECOND = "from foamfit.solve.precompile import compile_second; compile_second()"
+LONGEST = 300.0  # s that the second process may take
 
 
 def run(loop: str, model: str = "microscale") -> None:
@@ -37,17 +40,57 @@ def run(loop: str, model: str = "microscale") -> None:
             scene.run(*chain.arrays[:2], 1e-2, directions=np.zeros((1, 2), np.int64))
 
 
+def compile_first() -> None:
+    """Compile the rates of the state and the explicit step."""
+    from foamfit.solve.compiled import events, explicit, motion
+
+    for one in (motion.compute_rates, events.enter_branch, explicit.step):
+        one.compiled  # noqa: B018
+
+
+def compile_second() -> None:
+    """Compile what passes events and writes samples."""
+    from foamfit.solve.compiled import loop, samples
+
+    gc.disable()
+    for one in (loop.advance, samples.sample_task):
+        one.compiled  # noqa: B018
+
+
+@contextmanager
+def _second_process() -> Iterator[None]:
+    """Compile in a second process meanwhile, if the system allows one, and wait for its end."""
+    process, none = None, subprocess.DEVNULL
+    with suppress(OSError):
+        command = [sys.executable, "-c", SECOND]
+        process = subprocess.Popen(command, stdin=none, stdout=none, stderr=none)
+    try:
+        yield
+        if process is not None:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(LONGEST)
+    finally:
+        if process is not None:
+            process.kill()
+            process.wait()
+
+
 def compile_solver(model: str = "bistable", announce: Callable[[], None] | None = None) -> None:
     """Announce and compile what a fit of a model needs, unless it is in the cache."""
     missing = [loop for loop in LOOPS if not cache.compiled(loop)]
     if not missing:
         return
     (announce or (lambda: cache.warn("the solver")))()
+    model = model if model != "auto" else "bistable+microscale"
     cache.LOG.disabled = True  # it has been said that the solver is compiled
     gc.disable()  # a fifth of the time
     try:
+        if "integrate" in missing:
+            with _second_process():
+                compile_first()
+                run("follow", model)
         for loop in missing:
-            run(loop, model if model != "auto" else "bistable+microscale")
+            run(loop, model)
     finally:
         gc.enable()
         cache.LOG.disabled = False

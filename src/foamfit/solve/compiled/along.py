@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from foamfit.solve.compiled.events import change_branch
 from foamfit.solve.compiled.motion import PART, call_inside, evaluate
 from foamfit.solve.compiled.run import RECORD, begin_run
@@ -22,7 +20,6 @@ from foamfit.springs.compiled.contract import (
     BY_HELD,
     BY_STRESS,
     INTERNAL,
-    OPTIONS,
     REAL,
     REALS_AT,
     RELAX,
@@ -32,6 +29,7 @@ from foamfit.springs.compiled.contract import (
     call_number,
     calling,
     inner,
+    outer,
     past,
     start,
 )
@@ -239,7 +237,7 @@ def go_to(c, eps, between, m, seed, tol, weight):  # type: ignore[no-untyped-def
             return
 
 
-@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
+@outer
 def follow(  # type: ignore[no-untyped-def]
     ints, floats, rows, heights, mass, reals, strains, time, out, log, samples
 ):  # fmt: skip

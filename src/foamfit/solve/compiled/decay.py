@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import math
 
-from numba import cfunc
-
 from foamfit.solve.compiled.along import (
     FADING,
     FOLLOWED,
@@ -29,12 +27,12 @@ from foamfit.springs.compiled.contract import (
     ALONG_B,
     DIRECTION,
     EPS,
-    OPTIONS,
     PATHS,
     X,
     call_evaluate,
     inner,
     past,
+    pointed,
 )
 
 DEPENDS = 1e-9  # relative change of N that is not rounding
@@ -181,8 +179,8 @@ def _keep(c, seed, h):  # type: ignore[no-untyped-def]
         _change(c, seed, 1)
 
 
-@cfunc(FADING, **OPTIONS, cache=True)
-def _fade(words, part, h, tol, seed, room):  # type: ignore[no-untyped-def]
+@pointed(FADING)
+def fade(words, part, h, tol, seed, room):  # type: ignore[no-untyped-def]
     """Step to a strain within h; begin a run if h is zero, go back a step if it is negative.
 
     `room` becomes the stress in the middle of the step, its slopes at both ends, and its
@@ -229,6 +227,3 @@ def _fade(words, part, h, tol, seed, room):  # type: ignore[no-untyped-def]
     derive(c, seed)
     room[2] = _slope(c, step, h)
     return SAME + c.none
-
-
-FADE = _fade.address

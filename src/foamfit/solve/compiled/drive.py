@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import cfunc
 
 from foamfit.solve.compiled.events import MIDDLE, suspicious
 from foamfit.solve.compiled.explicit import SHORT, SHORTENING, combine
@@ -29,12 +28,12 @@ from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled.contract import (
     BY_STRESS,
     INTERNAL,
-    OPTIONS,
     RELAX,
     WHOLE,
     WHOLES_AT,
     inner,
     past,
+    pointed,
 )
 
 SHORT_TIMES = np.array((0.5, 0.75, 1.0))
@@ -162,8 +161,8 @@ def _next_piece(c, want):  # type: ignore[no-untyped-def]
     return c.none
 
 
-@cfunc(WHOLE(WHOLES_AT, WHOLE, WHOLE), **OPTIONS, cache=True)
-def _drive(words, starts, want):  # type: ignore[no-untyped-def]
+@pointed(WHOLE(WHOLES_AT, WHOLE, WHOLE))
+def next_piece(words, starts, want):  # type: ignore[no-untyped-def]
     """Start from rest, or begin the next piece; return whether all samples are written."""
     c = unpack(words)
     if not starts:
@@ -175,9 +174,6 @@ def _drive(words, starts, want):  # type: ignore[no-untyped-def]
     rates(c, c.y, c.stage, want, 0.0)
     write(c, c.y, 0.0, c.none, want)
     return int(c.samples == 1)
-
-
-DRIVE = _drive.address
 
 
 # ---------------------------------------------------------------- steps from sample to sample
@@ -210,8 +206,8 @@ def _take_short(c, n, want, tol):  # type: ignore[no-untyped-def]
     return math.sqrt(total / c.base)
 
 
-@cfunc(SHORTENING, **OPTIONS, cache=True)
-def _short_step(words, want, tol):  # type: ignore[no-untyped-def]
+@pointed(SHORTENING)
+def short_step(words, want, tol):  # type: ignore[no-untyped-def]
     """Try one step over a whole piece of the drive; return whether it was taken."""
     c = unpack(words)
     r = c.now
@@ -225,6 +221,3 @@ def _short_step(words, want, tol):  # type: ignore[no-untyped-def]
         return 1 + c.none
     r.paused = PAUSE
     return c.none
-
-
-SHORT_STEP = _short_step.address

@@ -5,7 +5,7 @@ Events are found on the dense output of a step.
 
 from __future__ import annotations
 
-from numba import cfunc, types
+from numba import types
 
 from foamfit.solve.compiled.motion import JUMP, call_inside, look
 from foamfit.solve.compiled.run import RECORD, numbers, spring, unpack
@@ -16,7 +16,6 @@ from foamfit.springs.compiled.contract import (
     OF_HELD,
     OF_PARAMETER,
     OF_STRESS,
-    OPTIONS,
     REAL,
     REALS_AT,
     RESULTS,
@@ -27,6 +26,7 @@ from foamfit.springs.compiled.contract import (
     inlined,
     inner,
     past,
+    pointed,
 )
 from foamfit.springs.laws.record import OWN_ETA
 
@@ -53,8 +53,9 @@ def take_step(c, want, tol, upto, most):  # type: ignore[no-untyped-def]
     return _call_step(c.step_at, c, want, tol, upto, most)
 
 
-@cfunc(types.void(WHOLES_AT, WHOLE, WHOLE, REALS_AT), **OPTIONS, cache=True)
-def _change_branch(words, i, up, y):  # type: ignore[no-untyped-def]
+@pointed(types.void(WHOLES_AT, WHOLE, WHOLE, REALS_AT))
+def enter_branch(words, i, up, y):  # type: ignore[no-untyped-def]
+    """Leave the branch of a spring at its upper or lower end, and enter the next."""
     c = unpack(words)
     s, n, p = spring(c, i), numbers(c, i), c.p
     out, kind, directions = past(s, RESULTS), n.kind, c.directions
@@ -78,9 +79,6 @@ def _change_branch(words, i, up, y):  # type: ignore[no-untyped-def]
             if directions[2 * j] == i and 0 <= own < OWN_ETA:
                 value += by[OF_PARAMETER + own]
             held[h * p + j] = value
-
-
-CHANGE = _change_branch.address
 
 
 _call_change = calling(types.void, RECORD, WHOLE, WHOLE, REALS_AT)

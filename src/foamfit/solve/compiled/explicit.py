@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import cfunc
 from scipy.integrate import RK23
 from scipy.integrate._ivp import dop853_coefficients as pair
 
@@ -29,13 +28,13 @@ from foamfit.solve.compiled.events import (
 from foamfit.solve.compiled.motion import rates
 from foamfit.solve.compiled.run import RECORD, STEPPED, unpack
 from foamfit.springs.compiled.contract import (
-    OPTIONS,
     REAL,
     WHOLE,
     WHOLES_AT,
     calling,
     inner,
     past,
+    pointed,
 )
 
 #: record, whether with derivatives, tolerance; returns 1 if the step was taken
@@ -161,8 +160,8 @@ def make_dense(c, n, dt, at, tol, want):  # type: ignore[no-untyped-def]
     return LAST_TERM / tol * size
 
 
-@cfunc(STEPPING, **OPTIONS, cache=True)
-def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
+@pointed(STEPPING)
+def step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
     """Take one step, shorter ones until it is accurate; return how it ended.
 
     `upto` is the time of the next sample inside the piece. A step that may contain a switch or
@@ -202,6 +201,3 @@ def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
         if size > 0.0:
             r.grow = min(r.grow, AIMED * size**-0.143)
         return DOUBTFUL if doubtful else SAMPLED
-
-
-EXPLICIT_STEP = _step.address

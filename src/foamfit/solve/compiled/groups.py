@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import math
 
-from numba import cfunc
-
 from foamfit.solve.compiled.events import ROUNDED
 from foamfit.solve.compiled.motion import (
     GROUP,
@@ -32,7 +30,7 @@ from foamfit.solve.compiled.motion import (
 from foamfit.solve.compiled.run import numbers, spring, unpack
 from foamfit.solve.compiled.static import put, root, strain_at
 from foamfit.solve.scene import STRESS, VISCOUS
-from foamfit.springs.compiled.contract import BY_STRESS, INTERNAL, OPTIONS, RELAX, X, inner, past
+from foamfit.springs.compiled.contract import BY_STRESS, INTERNAL, RELAX, X, inner, past, pointed
 
 STANDS, MOVES = 1e-12, 1e-9  # relative rates that are nothing but rounding, and more than that
 SNAPPING = (0, 2, 3)  # parameters of a bistable law on which the stress at A1 depends
@@ -318,8 +316,8 @@ def _mark_one_sided(c, g):  # type: ignore[no-untyped-def]
                 c.sided[j] = 1.0
 
 
-@cfunc(GROUP, **OPTIONS, cache=True)
-def _group(words, g, y, f, want, at):  # type: ignore[no-untyped-def]
+@pointed(GROUP)
+def group_values(words, g, y, f, want, at):  # type: ignore[no-untyped-def]
     """Fill the values of the springs of a group and their part of the rates `f`; return S."""
     c = unpack(words)
     if want != ONLY_DERIVATIVES:
@@ -328,6 +326,3 @@ def _group(words, g, y, f, want, at):  # type: ignore[no-untyped-def]
         derive_group(c, g, y, f)
         _mark_one_sided(c, g)
     return c.carried[g]
-
-
-GROUP_AT = _group.address

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import cfunc
 
 from foamfit.solve.compiled.events import (
     DOUBTFUL,
@@ -28,7 +27,7 @@ from foamfit.solve.compiled.events import (
 from foamfit.solve.compiled.motion import rates
 from foamfit.solve.compiled.rates import is_unresolved, remember, stiffness_of
 from foamfit.solve.compiled.run import OF_V, OF_W, POINTS, STEPPED, SYSTEMS, spring, unpack
-from foamfit.springs.compiled.contract import OPTIONS, inner, past
+from foamfit.springs.compiled.contract import inner, past, pointed
 
 
 def _radau() -> tuple[np.ndarray, np.ndarray]:
@@ -382,8 +381,8 @@ def _allowed(c, h, excess, tol, rounded):  # type: ignore[no-untyped-def]
     return h
 
 
-@cfunc(STEPPING, **OPTIONS, cache=True)
-def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
+@pointed(STEPPING)
+def step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
     """Take one implicit step, shorter ones until it is accurate; return how it ended."""
     c = unpack(words)
     r, at = c.now, c.now.now
@@ -412,6 +411,3 @@ def _step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
     remember(c, h, max(upto - r.now, 0.0) if upto < math.inf else h)
     r.before = h
     return DOUBTFUL if suspicious(c, h) else SAMPLED
-
-
-IMPLICIT_STEP = _step.address

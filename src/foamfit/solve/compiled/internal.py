@@ -17,8 +17,6 @@ from __future__ import annotations
 
 import math
 
-from numba import cfunc
-
 from foamfit.solve.compiled.motion import (
     BEGIN_RAMP,
     END_RAMP,
@@ -44,7 +42,6 @@ from foamfit.springs.compiled.contract import (
     DIRECTION,
     EPS,
     INTERNAL,
-    OPTIONS,
     PATHS,
     RELAX,
     RESULTS,
@@ -56,6 +53,7 @@ from foamfit.springs.compiled.contract import (
     inner,
     last_point,
     past,
+    pointed,
 )
 from foamfit.springs.laws.record import OWN_ETA
 
@@ -340,8 +338,8 @@ def _end_ramp(c, want):  # type: ignore[no-untyped-def]
                     y[c.base + (n.x_at + k) * p + j] += first[k] * strain[j]
 
 
-@cfunc(INSIDE, **OPTIONS, cache=True)
-def _inside(words, task, i, up, y, f, quicker, out):  # type: ignore[no-untyped-def]
+@pointed(INSIDE)
+def inside_task(words, task, i, up, y, f, quicker, out):  # type: ignore[no-untyped-def]
     """Do one task, for a spring or a group."""
     c = unpack(words)
     if task == PART:
@@ -364,6 +362,3 @@ def _inside(words, task, i, up, y, f, quicker, out):  # type: ignore[no-untyped-
         _end_ramp(c, up)
     else:
         _jump(c, i, up, y)
-
-
-INSIDE_AT = _inside.address

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-from numba import cfunc, njit
-
 from foamfit.arrays import Array
 from foamfit.solve.compiled.events import (
     DOUBTFUL,
@@ -39,7 +37,6 @@ from foamfit.springs.compiled.contract import (
     BY,
     BY_STRESS,
     INTERNAL,
-    OPTIONS,
     RELAX,
     RESULTS,
     WHOLE,
@@ -47,7 +44,9 @@ from foamfit.springs.compiled.contract import (
     calling,
     inlined,
     inner,
+    outer,
     past,
+    pointed,
     start,
 )
 
@@ -260,8 +259,8 @@ def _begin(c, reals):  # type: ignore[no-untyped-def]
         approach(c, reals[SPEED])
 
 
-@cfunc(WHOLE(WHOLES_AT, WHOLE, WHOLE, WHOLE), **OPTIONS, cache=True)
-def _advance(words, how, struck, want):  # type: ignore[no-untyped-def]
+@pointed(WHOLE(WHOLES_AT, WHOLE, WHOLE, WHOLE))
+def advance(words, how, struck, want):  # type: ignore[no-untyped-def]
     """Go to the first event in the step or to its end, and write its samples.
 
     Return what happened: nothing, an event, the end of contact, or an event without any progress.
@@ -286,7 +285,6 @@ def _advance(words, how, struck, want):  # type: ignore[no-untyped-def]
     return (SWITCHED if moved else STALLED) + c.none
 
 
-ADVANCE = _advance.address
 _call_advance = calling(WHOLE, RECORD, WHOLE, WHOLE, WHOLE)
 
 
@@ -319,7 +317,7 @@ def _is_finite(c):  # type: ignore[no-untyped-def]
     return fine == c.shown * c.samples
 
 
-@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
+@outer
 def integrate(  # type: ignore[no-untyped-def]
     ints, floats, rows, heights, mass, reals, values, time, out, log, endings
 ):  # fmt: skip

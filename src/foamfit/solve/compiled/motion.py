@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from numba import cfunc, types
+from numba import types
 
 from foamfit.solve.compiled.run import RECORD, numbers, spring, unpack
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
@@ -21,7 +21,6 @@ from foamfit.springs.compiled.contract import (
     EPS,
     EXPLICIT,
     INTERNAL,
-    OPTIONS,
     PATHS,
     REAL,
     REALS_AT,
@@ -36,6 +35,7 @@ from foamfit.springs.compiled.contract import (
     inlined,
     inner,
     past,
+    pointed,
 )
 from foamfit.springs.laws.record import OWN_RELAXATION
 
@@ -299,8 +299,8 @@ def _stress_of_momentum(c, x):  # type: ignore[no-untyped-def]
     return c.drive.value - c.drive.dragged * c.state[1] - rate / c.now.step / c.per_mass[0]
 
 
-@cfunc(types.void(WHOLES_AT, REALS_AT, REALS_AT, WHOLE, REAL, WHOLE), **OPTIONS, cache=True)
-def _rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
+@pointed(types.void(WHOLES_AT, REALS_AT, REALS_AT, WHOLE, REAL, WHOLE))
+def compute_rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
     """Fill the rates f of a state y, or only the values of one group, or those in a step."""
     c = unpack(words)
     share = at
@@ -330,9 +330,6 @@ def _rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
             _accelerate(c, g, y, f, want, at)
     if only == IN_STEP and c.drive.overdamped > 0.0 and c.groups == 1:
         c.carried[0] = _stress_of_momentum(c, share)
-
-
-RATES = _rates.address
 
 
 @inlined

@@ -6,7 +6,7 @@ of displacements: of all nodes, or of the top only.
 
 from __future__ import annotations
 
-from numba import cfunc, types
+from numba import types
 
 from foamfit.solve.compiled.motion import dense, rates_of
 from foamfit.solve.compiled.run import BATCH, RECORD, numbers, spring, unpack
@@ -17,7 +17,6 @@ from foamfit.springs.compiled.contract import (
     BY_STRESS,
     INTERNAL,
     OF_LAW,
-    OPTIONS,
     REAL,
     REALS_AT,
     RELAX,
@@ -29,6 +28,7 @@ from foamfit.springs.compiled.contract import (
     inlined,
     inner,
     past,
+    pointed,
 )
 from foamfit.springs.laws.record import OWN_ETA, OWN_RELAXATION
 
@@ -259,8 +259,8 @@ def _fly(c, slope):  # type: ignore[no-untyped-def]
 # ---------------------------------------------------------------- called by address
 
 
-@cfunc(types.void(WHOLES_AT, REALS_AT, REAL, WHOLE, WHOLE), **OPTIONS, cache=True)
-def _samples(words, y, at, k, want):  # type: ignore[no-untyped-def]
+@pointed(types.void(WHOLES_AT, REALS_AT, REAL, WHOLE, WHOLE))
+def sample_task(words, y, at, k, want):  # type: ignore[no-untyped-def]
     """Write sample k from a state at a time, or do one of the tasks below zero."""
     c = unpack(words)
     if k == INSIDE:
@@ -271,9 +271,6 @@ def _samples(words, y, at, k, want):  # type: ignore[no-untyped-def]
         _approach(c, at)
     else:
         _write(c, y, at, k, want)
-
-
-WRITE = _samples.address
 
 
 _call_samples = calling(types.void, RECORD, REALS_AT, REAL, WHOLE, WHOLE)

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from foamfit.solve.compiled.events import change_branch
 from foamfit.solve.compiled.motion import ONLY_DERIVATIVES, evaluate, rates_of
 from foamfit.solve.compiled.run import begin_run, numbers, spring
 from foamfit.solve.compiled.samples import row_of
 from foamfit.solve.scene import STRESS
-from foamfit.springs.compiled.contract import BY_STRESS, OPTIONS, call_number, inner, past
+from foamfit.springs.compiled.contract import BY_STRESS, call_number, inner, outer, past
 
 LEAST = 1e-6  # strain to whose rounding error elongations are always resolved
 MOST_SWITCHES = 100_000  # of all springs between two samples
@@ -245,7 +243,7 @@ def _write(c, k, now):  # type: ignore[no-untyped-def]
                 row_of(c, 1 + j, node)[k] = reach[j]
 
 
-@njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
+@outer
 def balance(  # type: ignore[no-untyped-def]
     ints, floats, rows, heights, mass, reals, values, time, out, log, history
 ):  # fmt: skip

@@ -40,7 +40,8 @@ the last point, at fixed strain, by dx (`x`) and, unless `count` is negative, by
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cached_property, partial
 from inspect import Parameter, Signature
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -109,6 +110,29 @@ REAL, WHOLE = types.float64, types.int64
 REALS_AT, WHOLES_AT = types.CPointer(REAL), types.CPointer(WHOLE)
 
 
+class Pointed:
+    """A function that others call by its address; it is compiled when this is first asked for."""
+
+    def __init__(self, signature: Any, function: Callable[..., Any]) -> None:
+        """Give the function and its signature."""
+        self.signature, self.function = signature, function
+
+    @cached_property
+    def compiled(self) -> Any:
+        """The compiled function, from numba's cache if it is there."""
+        return cfunc(self.signature, **OPTIONS, cache=True)(self.function)
+
+    @property
+    def address(self) -> int:
+        """The address of the compiled function."""
+        return int(self.compiled.address)
+
+
+def pointed(signature: Any) -> Callable[[Callable[..., Any]], Pointed]:
+    """Return a decorator for a function of this signature."""
+    return partial(Pointed, signature)
+
+
 class Named(types.CPointer):  # type: ignore[misc]
     """A pointer to numbers some of which have a name: `s.eps` is `s[EPS]`."""
 
@@ -160,13 +184,10 @@ SPRING = Named(
         for k, name in enumerate(names)
     },
 )
-evaluating = cfunc(
-    REAL(REALS_AT, SPRING, REALS_AT, REALS_AT, WHOLE, WHOLE, REALS_AT), **OPTIONS, cache=True
-)
-switching = cfunc(REAL(REALS_AT, SPRING, WHOLE, REALS_AT), **OPTIONS, cache=True)
-beginning = cfunc(REAL(REALS_AT, SPRING), **OPTIONS, cache=True)
-settling = cfunc(REAL(REALS_AT, SPRING, REAL), **OPTIONS, cache=True)
-inverting = cfunc(REAL(REALS_AT, SPRING, REAL), **OPTIONS, cache=True)
+evaluating = pointed(REAL(REALS_AT, SPRING, REALS_AT, REALS_AT, WHOLE, WHOLE, REALS_AT))
+switching = pointed(REAL(REALS_AT, SPRING, WHOLE, REALS_AT))
+beginning = pointed(REAL(REALS_AT, SPRING))
+settling = inverting = pointed(REAL(REALS_AT, SPRING, REAL))
 
 
 class Compiled(NamedTuple):

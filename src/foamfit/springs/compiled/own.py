@@ -9,7 +9,6 @@ below are compiled once, and call it by the address that its spring keeps in mem
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from llvmlite import ir
 from numba import types
@@ -57,9 +56,6 @@ from foamfit.springs.compiled.contract import (
     start,
     switching,
 )
-
-if TYPE_CHECKING:
-    pass
 
 STEP = 1e-40  # imaginary step
 # What the function of a law fills: σ, V, A and B; the ends of the branch; or the internal variables
