@@ -5,17 +5,14 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from concurrent.futures import Future
 from typing import Any
 
 import pytest
 
 import fabricated
-import foamfit.study.processes
 from conftest import EXPERIMENTS
-from foamfit.cli.options import drawing
 from foamfit.report.result_figures import Images, draw_all
-from foamfit.study.processes import EndedError
+from foamfit.study.processes import DRAWING, workers
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 
@@ -26,7 +23,7 @@ def drawn_here() -> dict[str, Images | None]:
 
 
 def test_other_processes_draw_the_same(drawn_here: dict[str, Images | None]) -> None:
-    with drawing(True) as mapped:
+    with workers(2, 2, preload=DRAWING) as mapped:
         assert dict(draw_all(fabricated.result(), mapped=mapped)) == drawn_here
     fit = drawn_here["fit"]
     assert fit is not None
@@ -35,23 +32,6 @@ def test_other_processes_draw_the_same(drawn_here: dict[str, Images | None]) -> 
     shown = drawn_here["shown"]
     assert shown is not None
     assert b"stress (MPa)</text>" in shown.svg
-
-
-@pytest.mark.parametrize(
-    "error", [EndedError("its process ended 2 times"), ImportError("no functioning sem_open")]
-)
-def test_where_processes_end_this_one_draws(
-    monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
-    def ended(*_: Any) -> Future[Any]:
-        told: Future[Any] = Future()
-        told.set_exception(error)
-        return told
-
-    monkeypatch.setattr(foamfit.study.processes.Processes, "submit", ended)
-    monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 2)
-    with drawing(True) as mapped:
-        assert list(mapped(str.upper, ["fit", "shown"])) == ["FIT", "SHOWN"]
 
 
 def a_process(code: str, *arguments: str) -> tuple[str, set[str]]:

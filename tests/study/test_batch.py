@@ -390,9 +390,21 @@ def test_a_scheduler_that_cannot_be_reached_is_one_sentence(here, monkeypatch):
     assert not Path("out").exists()
 
 
+def test_a_worker_that_sees_other_files_is_a_row(here, tried):
+    class Elsewhere(Inline):
+        def submit(self, fn, task):
+            return super().submit(fn, replace(task, where=here / "elsewhere"))
+
+    (here / "elsewhere").mkdir()
+    row = again(executor=Elsewhere()).set_index("test").loc["a"]
+    assert row["status"] == "refused"
+    assert "does not see the same files" in row["error"]
+    assert not tried
+
+
 @posix
 def test_a_dask_cluster_loses_a_worker_and_no_test(here):
-    """Two workers without access to this file system; one is killed during the batch."""
+    """Two workers in another folder; one is killed during the batch."""
     distributed = pytest.importorskip("distributed")
     (here / "tests/bad.csv").unlink()
     (here / "elsewhere").mkdir()

@@ -169,6 +169,7 @@ def fit(
     model = asked["model"] = model_name(asked)
     from foamfit.data.toml_file import toml_beside
     from foamfit.report.folder import check_same
+    from foamfit.study.processes import DRAWING, workers
 
     ready, toml = read_as_asked(test, specimen, asked), toml_beside(test)
     made = ready.options
@@ -182,7 +183,8 @@ def fit(
 
     check(folder)
     options.compile_solver(output.silent, model)
-    with options.drawing(not output.no_report) as mapped:
+    # Two processes import matplotlib while the fit runs, and draw the figures.
+    with workers(None, 1 if output.no_report else 2, preload=DRAWING) as mapped:
         with progress_line(output.silent, "fit", says=not output.quiet) as news:
             found = replace(ready.fit(news), options=made)
         page = folder / ("report.html" if ready.several is None else "cycles.png")

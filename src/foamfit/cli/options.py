@@ -6,8 +6,7 @@ import functools
 import json
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,8 +21,6 @@ from foamfit.options import OPTIONS
 from foamfit.terminal import say, without_ctrl_c
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future
-
     from foamfit.report.result_figures import Mapped
     from foamfit.report.shown import Result
 
@@ -275,33 +272,3 @@ def compile_solver(quiet: bool, model: str = "bistable") -> None:
             say(f"foamfit: {cache.compiling('the solver')}", err=True)
 
     precompile.compile_solver(model, tell)
-
-
-@contextmanager
-def drawing(wanted: bool) -> Iterator[Mapped]:
-    """Yield a `map` that draws figures in two processes, at once, or here with a single core."""
-    from foamfit.study import processes
-
-    pool = None
-    if wanted and processes.cores() > 1:
-        with suppress(OSError):  # the system allows no more processes
-            pool = processes.Processes(2, processes.DRAWING)
-    if pool is None:
-        yield map
-        return
-
-    def start(draw: Callable[[str], Any], names: Iterable[str]) -> Iterable[Any]:
-        begun = [(name, pool.submit(draw, name)) for name in names]
-        return (_drawn(one, draw, name) for name, one in begun)
-
-    try:
-        yield start
-    finally:
-        pool.stop()
-
-
-def _drawn(begun: Future[Any], draw: Callable[[str], Any], name: str) -> Any:
-    try:
-        return begun.result()
-    except Exception:  # if the figure is at fault, drawing it here raises the error
-        return draw(name)

@@ -15,8 +15,12 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
-from concurrent.futures import ThreadPoolExecutor as Threads
+from concurrent.futures import (
+    CancelledError,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from functools import partial
@@ -31,7 +35,7 @@ from foamfit.terminal import without_ctrl_c
 FITS = ("foamfit.study.batch_work", "foamfit.data.csv_file", "pandas", "pint")
 PAGES = ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf", "jinja2")
 DRAWING = ("foamfit.report.result_figures", "foamfit.solve.compiled.loop", *PAGES)
-_JOINT = ("foamfit.study.joint", "foamfit.report.plots", *PAGES)
+JOINT = ("foamfit.study.joint", "foamfit.report.plots", *PAGES)
 ATTEMPTS = 2  # number of attempts of a call whose process ends
 # One thread per process, as there is one process per core.
 ONE_THREAD = {
@@ -64,7 +68,7 @@ def prepare(preload: Iterable[str]) -> None:
             forkserver.ensure_running()
 
 
-class Processes(Executor):
+class Processes(ThreadPoolExecutor):
     """An executor with `count` single-threaded processes, which end with their parent process.
 
     A call whose process ends is repeated in a new process, with `ATTEMPTS` attempts in total, and
@@ -73,21 +77,21 @@ class Processes(Executor):
     """
 
     def __init__(self, count: int, preload: tuple[str, ...] = ()) -> None:
+        super().__init__(count, thread_name_prefix="foamfit")
         server = "forkserver" in multiprocessing.get_all_start_methods()
         self._context: Any = multiprocessing.get_context("forkserver" if server else "spawn")
         prepare(preload)
-        self._threads = Threads(count, thread_name_prefix="foamfit")
         self._pools = dict[int, ProcessPoolExecutor]()  # by the thread that uses it
         self._stop, self._stopping = self._context.Pipe(duplex=False)
         self._stopped = False
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Schedule the call of a function in one of the processes."""
-        return self._threads.submit(self._call, partial(fn, *args, **kwargs))
+        return super().submit(self._call, partial(fn, *args, **kwargs))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes after their current calls."""
-        self._threads.shutdown(wait, cancel_futures=cancel_futures)
+        super().shutdown(wait, cancel_futures=cancel_futures)
         for pool in list(self._pools.values()):
             pool.shutdown(wait)
         self._stopping.close()
@@ -104,7 +108,7 @@ class Processes(Executor):
         self.shutdown(cancel_futures=True)
 
     def _call(self, work: Callable[[], Any]) -> Any:
-        """Run a call in the process of the current thread, which is one of `_threads`."""
+        """Run a call in the process of the current thread."""
         from foamfit.springs import laws
 
         thread = threading.get_ident()
@@ -127,7 +131,9 @@ class Processes(Executor):
 
 
 @contextmanager
-def workers(jobs: int | None, count: int, few: int) -> Iterator[Callable[..., Iterable[Any]]]:
+def workers(
+    jobs: int | None, count: int, few: int = 1, preload: tuple[str, ...] = JOINT
+) -> Iterator[Callable[..., Iterable[Any]]]:
     """Yield a `map` for `count` pieces of work in `jobs` processes (None: one per core).
 
     It is the built-in `map` for one job or up to `few` pieces of work, because starting a process
@@ -139,7 +145,7 @@ def workers(jobs: int | None, count: int, few: int) -> Iterator[Callable[..., It
     if wanted < 2:
         yield map
         return
-    with Processes(wanted, _JOINT) as pool:
+    with Processes(wanted, preload) as pool:
         yield pool.map
 
 
