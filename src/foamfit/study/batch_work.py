@@ -9,7 +9,7 @@ import hashlib
 import json
 import platform
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import chdir
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
