@@ -75,12 +75,12 @@ class FitResult(Result, Fit):
         about = {"test": self.measurement.name, "model": self.words}
         return dataset(self.draws, **about) if self.draws else None
 
-    def _shown(self, *, html: bool = False) -> str:
+    def __repr__(self) -> str:
         """Return status, model, misfit and parameters."""
         misfits = ", ".join(f"{name} {percent(misfit)}" for name, misfit in compared(self).items())
         line = f"{self.law}, {self.drive} drive · status {self.status} · misfit: {misfits or '–'}"
         rows = [readable(name, p) for name, p in self.parameters.items() if p.state != "fixed"]
-        return brief(self.measurement.name, line, rows, html)
+        return brief(self.measurement.name, line, rows)
 
 
 @documented

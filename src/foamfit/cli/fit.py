@@ -169,7 +169,6 @@ def fit(
     model = asked["model"] = model_name(asked)
     from foamfit.data.toml_file import toml_beside
     from foamfit.report.folder import check_same
-    from foamfit.study.processes import DRAWING, workers
 
     ready, toml = read_as_asked(test, specimen, asked), toml_beside(test)
     made = ready.options
@@ -183,9 +182,7 @@ def fit(
 
     check(folder)
     options.compile_solver(output.silent, model)
-    # Two processes import matplotlib while the fit runs, and draw the figures.
-    with workers(None, 1 if output.no_report else 2, preload=DRAWING) as mapped:
-        with progress_line(output.silent, "fit", says=not output.quiet) as news:
-            found = replace(ready.fit(news), options=made)
-        page = folder / ("report.html" if ready.several is None else "cycles.png")
-        return output.finish(found, page, check=check, verbose=verbose, mapped=mapped)
+    with progress_line(output.silent, "fit", says=not output.quiet) as news:
+        found = replace(ready.fit(news), options=made)
+    page = folder / ("report.html" if ready.several is None else "cycles.png")
+    return output.finish(found, page, check=check, verbose=verbose)

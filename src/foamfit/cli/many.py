@@ -171,11 +171,8 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
     read = read_study(study)
     output.folder(folder, [path for _, path, _ in read.tests])
     from foamfit.study.joint import joint as fit_jointly
-    from foamfit.study.joint_result import FEW_FOLDERS
-    from foamfit.study.processes import workers
 
     options.compile_solver(output.silent, read.model)
-    with workers(jobs, len(read.tests), FEW_FOLDERS) as each:
-        with progress_line(output.silent, "joint fit") as line:
-            found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress)
-        return output.finish(found, folder / "joint.html", mapped=each)
+    with progress_line(output.silent, "joint fit") as line:
+        found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress)
+    return output.finish(found, folder / "joint.html")

@@ -21,7 +21,6 @@ from foamfit.options import OPTIONS
 from foamfit.terminal import say, without_ctrl_c
 
 if TYPE_CHECKING:
-    from foamfit.report.result_figures import Mapped
     from foamfit.report.shown import Result
 
 Command = Callable[..., Any]
@@ -173,7 +172,6 @@ class Output:
         *,
         check: Callable[[Path], object] = lambda _: None,
         verbose: bool = False,
-        mapped: Mapped = map,
     ) -> int:
         """Save a result in the folder of `page`, print it and its place; return the exit code.
 
@@ -183,7 +181,7 @@ class Output:
 
         def save(place: Path, **how: Any) -> None:
             check(place)  # another fit may have written there in the meantime
-            found.save(place, figure_width=self.figure_width, mapped=mapped, **how)
+            found.save(place, figure_width=self.figure_width, **how)
 
         try:
             with progress_line(self.silent, "result") as line, without_ctrl_c():

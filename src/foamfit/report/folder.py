@@ -18,8 +18,8 @@ from foamfit.arrays import Array
 from foamfit.codec import plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, reason, replacing
-from foamfit.report.figures import TWO
-from foamfit.report.result_figures import Mapped, draw_all
+from foamfit.report.figures import TWO, image
+from foamfit.report.result_figures import figures_of
 from foamfit.report.summary import render_report
 from foamfit.report.tables import numbers_of, parameters_tex, with_head
 from foamfit.results import SCHEMA, Fit
@@ -238,16 +238,12 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     return content
 
 
-def write_result(
-    result: Fit, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
-) -> None:
+def write_result(result: Fit, folder: Path, *, pages: bool = True, width: str = TWO) -> None:
     """Write all files of a result into an existing folder; report and figures only with `pages`.
 
     ``profiles.csv`` is written if there are profiles, ``budget.csv`` if the budget contains more
-    than the parameters. For `width` and `mapped` see
-    `foamfit.report.result_figures.draw_all`.
+    than the parameters.
     """
-    figures = draw_all(result, width, mapped) if pages else ()  # other processes start to draw now
     write_json(folder / "fit.json", result.to_json_dict())
     texts = ("unit", "state", "why", "ci95_method")
     parameters = (
@@ -264,11 +260,10 @@ def write_result(
         write_samples(folder / SAMPLES, result.draws)
     if pages and result.budget is not None and result.budget.telling:
         write_table(folder / "budget.csv", result.budget.rows())
-    for name, images in (drawn := dict(figures)).items():
-        for kind in ("png", "pdf"):
-            if content := getattr(images, kind, b""):
-                (folder / f"{name}.{kind}").write_bytes(content)
     if pages:
+        drawn = figures_of(result, width)
+        (folder / "fit.png").write_bytes(image(drawn["fit"], "png"))
+        (folder / "fit.pdf").write_bytes(image(drawn["fit"], "pdf"))
         write_text(folder / "report.html", render_report(result, drawn))
 
 

@@ -159,7 +159,7 @@ def _fitted(task: Task) -> tuple[tuple[Row, ...], Write]:
 def _results(task: Task) -> tuple[tuple[Row, ...], Write]:
     """Return one row, or one per cycle (a subfolder), and a function that writes the files."""
     recipe, path, file = task.recipe, task.path, str(task.path)
-    pictures: Any = {"pages": recipe.pages, "width": recipe.width, "mapped": map}
+    pictures: Any = {"pages": recipe.pages, "width": recipe.width}
     if not isinstance(recipe.cycles, tuple):
         test = read_test(path, task.toml, recipe.cycles, cycles=recipe.history)
         result = fit(test, model=recipe.model, **recipe.options)

@@ -29,7 +29,7 @@ from foamfit.springs.model import Model
 from foamfit.study import joint_fit
 from foamfit.study.joint_fit import Map, fit_jointly
 from foamfit.study.joint_parameters import result_of
-from foamfit.study.joint_result import FEW_FOLDERS, JointResult
+from foamfit.study.joint_result import JointResult
 from foamfit.study.processes import workers
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
@@ -125,8 +125,7 @@ def joint(
         result = result_of(study, files, rates, rate0, fit, alone, slopes, **about)
     tell(1.0, "done")
     if out is not None:
-        with workers(jobs, len(result.tests), FEW_FOLDERS) as each:
-            result.save(out, report=report, mapped=each)
+        result.save(out, report=report)
     return result
 
 

@@ -23,7 +23,6 @@ from foamfit.report.listing import Row, table_of
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import readable, readable_unit
 from foamfit.report.render import page, words
-from foamfit.report.result_figures import Mapped
 from foamfit.report.shown import Result, brief
 from foamfit.report.studies.parameters import Panel, plot_parameters
 from foamfit.report.tables import MISFITS, formula, frame, parameters_tex, stacked, symbols
@@ -31,6 +30,7 @@ from foamfit.results import SCHEMA, Fit, Loop
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.joint_fit import Alternative, JointFit
+from foamfit.study.processes import workers
 from foamfit.text import counted, number
 from foamfit.trust.covariance import RULE
 
@@ -142,11 +142,11 @@ class JointResult(Result):
             frames[test] = frame(each, kind=kinds, scatter={}, b={})
         return stacked(frames, "test")
 
-    def _shown(self, *, html: bool = False) -> str:
+    def __repr__(self) -> str:
         """Return name, model, number of tests, status and the common values."""
         line = f"{self.model} · {counted(len(self.tests), 'test')} together · status {self.status}"
         rows = [readable(name, p) for name, p in self.varied.items()]
-        return brief(self.name, line, rows, html)
+        return brief(self.name, line, rows)
 
     def text(self, *, verbose: bool = False) -> str:
         """Return the text that the command prints."""
@@ -156,9 +156,7 @@ class JointResult(Result):
         more: Any = {"parameters": every, "nuisance": NUISANCE, "between": _between}
         return words("joint", found=self, most=MOST_ROWS, curves=curves, **more)
 
-    def write(
-        self, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
-    ) -> None:
+    def write(self, folder: Path, *, pages: bool = True, width: str = TWO) -> None:
         """Write joint.json, its page, its figure, table.tex, and a result folder per test."""
         write_json(folder / "joint.json", self.to_json_dict())
         shown = self.of_springs
@@ -166,16 +164,10 @@ class JointResult(Result):
         between = {name: _between(one) for name, one in shown.items()}
         write_text(folder / "table.tex", parameters_tex(shown, kinds=kinds, between=between))
         folders, n = [folder / name for name in self.tests], len(self.tests)
-        # If other processes write these folders, the common figure is drawn at the same time.
-        written = mapped(_write_test, self.fits, folders, [pages] * n, [width] * n)
-        svg = b""
+        with workers(None, n, FEW_FOLDERS if pages else n) as each:
+            list(each(_write_test, self.fits, folders, [pages] * n, [width] * n))
         if pages:
             svg = figures.write_both(plot_joint(self, width=width), folder / "joint")
-            if width != TWO:  # the page has room for two columns
-                svg = figures.image(plot_joint(self), "svg")
-        for _ in written:
-            pass
-        if pages:
             write_text(folder / "joint.html", joint_page(self, folder, svg))
 
     def to_json_dict(self) -> dict[str, Any]:

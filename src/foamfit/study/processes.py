@@ -31,11 +31,10 @@ from typing import Any
 from foamfit.errors import check_whole
 from foamfit.terminal import without_ctrl_c
 
-# Modules that are imported by fits, by their pages, by the drawing of figures and by joint fits.
+# Modules that are imported by fits, by their pages and by joint fits.
 FITS = ("foamfit.study.batch_work", "foamfit.data.csv_file", "pandas", "pint")
 PAGES = ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf", "jinja2")
-DRAWING = ("foamfit.report.result_figures", "foamfit.solve.compiled.loop", *PAGES)
-JOINT = ("foamfit.study.joint", "foamfit.report.plots", *PAGES)
+_JOINT = ("foamfit.study.joint", "foamfit.report.plots", *PAGES)
 ATTEMPTS = 2  # number of attempts of a call whose process ends
 # One thread per process, as there is one process per core.
 ONE_THREAD = {
@@ -131,9 +130,7 @@ class Processes(ThreadPoolExecutor):
 
 
 @contextmanager
-def workers(
-    jobs: int | None, count: int, few: int = 1, preload: tuple[str, ...] = JOINT
-) -> Iterator[Callable[..., Iterable[Any]]]:
+def workers(jobs: int | None, count: int, few: int) -> Iterator[Callable[..., Iterable[Any]]]:
     """Yield a `map` for `count` pieces of work in `jobs` processes (None: one per core).
 
     It is the built-in `map` for one job or up to `few` pieces of work, because starting a process
@@ -145,7 +142,7 @@ def workers(
     if wanted < 2:
         yield map
         return
-    with Processes(wanted, preload) as pool:
+    with Processes(wanted, _JOINT) as pool:
         yield pool.map
 
 
