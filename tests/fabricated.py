@@ -7,6 +7,7 @@ from typing import Any
 
 import lmfit
 import numpy as np
+from matplotlib.figure import Figure
 
 from foamfit.api import FitResult
 from foamfit.data.measurement import ASKED, Measurement, Specimen, Striker
