@@ -19,20 +19,6 @@ serve(None, 0, browser=False)
 """
 
 
-@pytest.fixture
-def portable(monkeypatch):
-    monkeypatch.setattr(system, "POSIX", False)
-
-
-def test_a_process_that_was_started_apart_is_killed(portable):
-    process = subprocess.Popen(
-        [sys.executable, "-c", "import time; time.sleep(60)"], **system.apart()
-    )
-    system.end_all(process)
-    assert process.returncode != 0
-    system.end_all(process)  # again, after its end
-
-
 def test_the_page_ends_cleanly_without_signal_handlers_of_the_loop(tmp_path):
     pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
     process = subprocess.Popen(

@@ -101,13 +101,6 @@ def read_scene(path: Path) -> tuple[Chain, Drive, Array]:
     return chain, StressDrive(values) if kind == "stress" else DisplacementDrive(values), time
 
 
-def files_of_scene(path: Path) -> tuple[Path, ...]:
-    """Return the path of the scene file and, if it names one, of the file of its drive."""
-    drive = load_toml(path, "give the TOML file of a scene").get("drive")
-    file = drive.get("file") if isinstance(drive, dict) else None
-    return (path, path.parent / file) if isinstance(file, str) else (path,)
-
-
 def _table(document: dict[str, Any], name: str) -> dict[str, Any]:
     if not isinstance(document.get(name), dict):
         raise InputError(f"the table [{name}] is missing; see foamfit simulate --help.")

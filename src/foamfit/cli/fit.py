@@ -174,7 +174,7 @@ def fit(
     made = ready.options
     if specimen not in (None, toml):
         made["specimen"] = specimen.stem
-    folder = output.folder(Path("fits", toml.stem, folder_name(made)), (test, specimen or toml))
+    folder = output.folder(Path("fits", toml.stem, folder_name(made)))
 
     def check(place: Path) -> None:
         if not force:

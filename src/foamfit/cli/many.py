@@ -165,11 +165,10 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
     Also: seed, cycle, starts, and [specimens] with a TOML for single tests: new-heel-1 = "a.toml".
     """
     output.check(without_report=False)
-    folder = output.folder(Path("fits", study.stem), [study])
+    folder = output.folder(Path("fits", study.stem))
     from foamfit.study.study_file import read_study
 
     read = read_study(study)
-    output.folder(folder, [path for _, path, _ in read.tests])
     from foamfit.study.joint import joint as fit_jointly
 
     options.compile_solver(output.silent, read.model)

@@ -6,7 +6,7 @@ import functools
 import json
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -152,17 +152,12 @@ class Output:
             given = "json" if self.as_json else "no-report"
             raise InputError(f"--open and --{given} exclude each other; leave one of them out")
 
-    def folder(self, default: Path, inputs: Iterable[Path]) -> Path:
-        """Return the result folder; InputError if it cannot be written or holds an input."""
+    def folder(self, default: Path) -> Path:
+        """Return the result folder; InputError if it cannot be written."""
         from foamfit.report.folder import try_target
 
         folder = default if self.out is None else self.out
         try_target(folder)
-        for path in inputs:
-            if folder.is_dir() and folder.resolve() in path.resolve().parents:
-                raise InputError(
-                    f"{folder} contains {path.name} and would be replaced; choose another --out"
-                )
         return folder
 
     def finish(
@@ -243,19 +238,13 @@ def output(folder: str, printed: str) -> Callable[[Command], Command]:
     return add
 
 
-def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -> None:
-    """Raise InputError if an output cannot be written or is also an input of the command."""
-    given = [path for path in (table, plot) if path is not None]
-    for path in given:
-        check_file(path)
-        if path.resolve() in [source.resolve() for source in inputs]:
-            raise InputError(f"{path} is read by this command and would be lost; name another file")
-    if len({path.resolve() for path in given}) < len(given):
-        raise InputError(f"{given[0]} is named twice; the table and the figure must be two files")
+def check_plot(plot: Path | None) -> None:
+    """Raise InputError if a figure cannot be written."""
     if plot is not None:
         from foamfit.report.figures import figure_format
 
         figure_format(plot)
+        check_file(plot)
 
 
 def compile_solver(quiet: bool, model: str = "bistable") -> None:

@@ -119,12 +119,14 @@ def simulate(
     microscale spring has k0, kc, eps_star, sigma_plus, spread_plus, sigma_minus and spread_minus.
     Both may have relaxation terms: relaxation = [{ g = 0.5, tau = "0.2 s" }].
     """
-    from foamfit.scene_file import check_target, files_of_scene, read_scene, write_response
+    from foamfit.files import check_file
+    from foamfit.scene_file import check_target, read_scene, write_response
     from foamfit.solve.simulation import simulate as run
 
     target = Path(scene.with_suffix(".csv").name) if out is None else out
-    options.check_files(target, plot, files_of_scene(scene))
-    check_target(target)
+    options.check_plot(plot)
+    check_file(target)
+    check_target(target)  # the scene and its drive are kept, as every file of others
     chain, drive, time = read_scene(scene)
     options.compile_solver(quiet=False)
     response = run(chain, drive, time, rtol)
