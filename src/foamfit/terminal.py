@@ -14,8 +14,11 @@ from types import FrameType
 from typing import Any, TextIO
 
 from foamfit.errors import InputError
-from foamfit.system import ENDING
 
+# Signals that ask a process to end: Ctrl-C, `kill`, and on POSIX the end of the terminal.
+ENDING = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
 # Control characters except tab and new line, and characters that reverse the direction of writing:
 # in a file name they could move the cursor or hide text. Also surrogates (non-UTF-8 bytes).
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")

@@ -134,12 +134,11 @@ def _cluster(address: str) -> Iterator[Executor]:
 
 @main.command()
 @click.argument("study", metavar="STUDY.toml", type=options.FILE)
-@options.option("--jobs", "Processes. Default: one for each core.", options.COUNT)
 @options.declared(
     "seed", default=None, help="The same tests and seed give the same numbers. Default: 0."
 )
 @options.output("fits/<STUDY>", "joint.json")
-def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> int:
+def joint(study: Path, seed: int | None, output: Output) -> int:
     """Fit the tests of STUDY.toml together.
 
     Parameters are shared, own (one per test), scattering or rate-dependent.
@@ -173,5 +172,5 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
 
     options.compile_solver(output.silent, read.model)
     with progress_line(output.silent, "joint fit") as line:
-        found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress)
+        found = fit_jointly(read, seed=seed, progress=line.progress)
     return output.finish(found, folder / "joint.html")

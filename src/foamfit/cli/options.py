@@ -154,10 +154,10 @@ class Output:
 
     def folder(self, default: Path) -> Path:
         """Return the result folder; InputError if it cannot be written."""
-        from foamfit.report.folder import try_target
+        from foamfit.report.folder import check_target
 
         folder = default if self.out is None else self.out
-        try_target(folder)
+        check_target(folder)
         return folder
 
     def finish(

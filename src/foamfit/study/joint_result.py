@@ -30,7 +30,7 @@ from foamfit.results import SCHEMA, Fit, Loop
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.joint_fit import Alternative, JointFit
-from foamfit.study.processes import workers
+from foamfit.study.processes import JOINT, Processes, cores
 from foamfit.text import counted, number
 from foamfit.trust.covariance import RULE
 
@@ -164,8 +164,12 @@ class JointResult(Result):
         between = {name: _between(one) for name, one in shown.items()}
         write_text(folder / "table.tex", parameters_tex(shown, kinds=kinds, between=between))
         folders, n = [folder / name for name in self.tests], len(self.tests)
-        with workers(None, n, FEW_FOLDERS if pages else n) as each:
-            list(each(_write_test, self.fits, folders, [pages] * n, [width] * n))
+        work = self.fits, folders, [pages] * n, [width] * n
+        if pages and n > FEW_FOLDERS and cores() > 1:
+            with Processes(min(cores(), n), JOINT) as pool:
+                list(pool.map(_write_test, *work))
+        else:
+            list(map(_write_test, *work))
         if pages:
             svg = figures.write_both(plot_joint(self, width=width), folder / "joint")
             write_text(folder / "joint.html", joint_page(self, folder, svg))

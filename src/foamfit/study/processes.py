@@ -28,13 +28,12 @@ from multiprocessing import connection
 from types import ModuleType
 from typing import Any
 
-from foamfit.errors import check_whole
 from foamfit.terminal import without_ctrl_c
 
-# Modules that are imported by fits, by their pages and by joint fits.
+# Modules that are imported by fits, by their pages and by the pages of a joint fit.
 FITS = ("foamfit.study.batch_work", "foamfit.data.csv_file", "pandas", "pint")
 PAGES = ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf", "jinja2")
-_JOINT = ("foamfit.study.joint", "foamfit.report.plots", *PAGES)
+JOINT = ("foamfit.study.joint", "foamfit.report.plots", *PAGES)
 ATTEMPTS = 2  # number of attempts of a call whose process ends
 # One thread per process, as there is one process per core.
 ONE_THREAD = {
@@ -127,23 +126,6 @@ class Processes(ThreadPoolExecutor):
         if self._stopped:
             raise CancelledError
         raise EndedError(f"its process ended {ATTEMPTS} times before it was done")
-
-
-@contextmanager
-def workers(jobs: int | None, count: int, few: int) -> Iterator[Callable[..., Iterable[Any]]]:
-    """Yield a `map` for `count` pieces of work in `jobs` processes (None: one per core).
-
-    It is the built-in `map` for one job or up to `few` pieces of work, because starting a process
-    takes some seconds. The processes start at the first call, and their imports at once.
-    """
-    if jobs is not None:
-        check_whole("jobs", jobs, 1)
-    wanted = 1 if count <= few else min(cores() if jobs is None else jobs, count)
-    if wanted < 2:
-        yield map
-        return
-    with Processes(wanted, _JOINT) as pool:
-        yield pool.map
 
 
 @contextmanager
