@@ -65,20 +65,13 @@ def init(test: Path, force: bool, rig: bool) -> None:
 
 def _write(target: Path, text: str, force: bool, kept: str) -> None:
     """Write a new file, or with `force` replace it; `kept` tells about an existing one."""
-    from foamfit.files import reason, write_file
+    from foamfit.files import write_file
 
-    try:
-        if force:
-            write_file(target, text.encode())
-        else:
-            with target.open("x", encoding="utf-8") as file:
-                file.write(text)
-    except FileExistsError:
+    if target.exists() and not force:
         raise InputError(
             f"{target} exists already and is not changed; {kept}, and --force overwrites it"
-        ) from None
-    except OSError as error:
-        raise InputError(f"{target} cannot be written: {reason(error)}") from None
+        )
+    write_file(target, text.encode())
 
 
 @main.command()

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -24,11 +24,6 @@ from foamfit.report.result_figures import figures_of
 from foamfit.report.summary import render_report
 from foamfit.report.tables import numbers_of, parameters_tex, with_head
 from foamfit.results import SCHEMA, Fit
-from foamfit.springs.parameters import unit_of
-
-if TYPE_CHECKING:
-    import xarray
-
 
 SAMPLES = "samples.npz"
 # Files of each kind of result, by the file that identifies it. They include files that only older
@@ -284,9 +279,6 @@ def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
     path.write_bytes(csv_bytes([columns, *samples]))
 
 
-_DIMS = ("chain", "draw")
-
-
 def read_samples(path: Path) -> dict[str, Array]:
     """Return the samples (chain, draw) of each parameter in SI; empty if there is no file."""
     if not path.is_file():
@@ -296,22 +288,3 @@ def read_samples(path: Path) -> dict[str, Array]:
             return dict(file)
     except (OSError, ValueError, BadZipFile) as error:
         raise InputError(f"{path} is damaged: {error}") from None
-
-
-def dataset(draws: Mapping[str, Array], **about: str) -> xarray.Dataset:
-    """Return samples in the form that ArviZ reads: dimensions chain and draw, attributes `units`.
-
-    Raises
-    ------
-    InputError
-        If xarray is not installed.
-    """
-    try:
-        import xarray
-    except ImportError:
-        raise InputError(
-            'samples need xarray, which is not installed; pip install "foamfit[mcmc]"'
-        ) from None
-    columns = {n: (_DIMS, values, {"units": unit_of(n) or "1"}) for n, values in draws.items()}
-    sizes = zip(_DIMS, next(iter(draws.values())).shape, strict=True)
-    return xarray.Dataset(columns, {dim: np.arange(size) for dim, size in sizes}, about)
