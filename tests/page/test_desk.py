@@ -53,12 +53,12 @@ class Here(Worker):
 
     def __init__(self, job):
         self.job, self.news, self.told, self.stopping = job, News(), "", False
+        self.ended = None
         self._pipe, there = worker_module.PROCESSES.Pipe()
         self.process = SimpleNamespace(join=lambda: None, kill=lambda: None)
         threading.Thread(target=self._listen, daemon=True).start()
         with there:
             there.send(worker_module._fitted(job, worker_module._Teller(there)))
-            self.ended = None
             while self.ended is None:
                 time.sleep(0.01)
 

@@ -38,8 +38,7 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 MOST_AHEAD = 1000  # tests submitted to the executor at a time
-PAUSE = 5.0  # least time between two summaries, s
-SHARE = 50.0  # least ratio of this time to the time that writing a summary takes
+PAUSE = 60.0  # least time between two summaries, s: of many tests, one takes seconds
 Tests = str | Path | Iterable[str | Path]
 Cycles = int | Sequence[int] | Literal["all"] | None
 
@@ -59,7 +58,6 @@ class Batch:
     fitted: int = 0  # number of tests fitted in this call
     wrong: int = 0  # number of finished tests without an acceptable fit
     saved: float = field(default_factory=lambda: time.monotonic())  # time of the last summary
-    took: float = 0.0  # time that writing the summary took, s
 
     @property
     def summary(self) -> list[Row]:
@@ -127,11 +125,9 @@ class Batch:
         done, _ = futures.wait(self.waiting, seconds, futures.FIRST_COMPLETED)
         for future in [future for future in self.waiting if future in done]:
             self._take(future)
-        began = time.monotonic()
-        if began - self.saved >= max(PAUSE, SHARE * self.took):
+        if time.monotonic() - self.saved >= PAUSE:
             self.save()
             self.saved = time.monotonic()
-            self.took = self.saved - began
 
     def _take(self, future: Future[tuple[Row, ...]]) -> None:
         task = self.waiting.pop(future)
