@@ -177,7 +177,7 @@ def unlike(tmp_path_factory):
 def test_the_range_of_a_shared_value_holds_that_of_a_mean_over_other_specimens(unlike):
     joint, error = unlike
     k0 = joint.parameters["s1_k0"]
-    low, high = joint_fit._over_specimens(joint.fit.found, map)["s1_k0"]
+    low, high = joint_fit._over_specimens(joint.fit.found)["s1_k0"]
     assert 0.5 * (high - low) == pytest.approx(stats.t.ppf(0.975, 4) * error, rel=0.3)
     assert low < 5.5e5 < high
     assert k0.range[0] <= low < high <= k0.range[1]
