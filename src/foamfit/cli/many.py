@@ -69,10 +69,6 @@ def batch(
         raise InputError("--jobs and --scheduler exclude each other; leave one of them out")
     output.check()
     search, cycles = keywords_of(asked), asked["cycle"]
-    from foamfit.study import processes
-
-    if scheduler is None:
-        processes.prepare((*processes.FITS, *(() if output.no_report else processes.PAGES)))
     from foamfit.report.listing import summary_words, table_rows
     from foamfit.study import batch as study
 

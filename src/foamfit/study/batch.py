@@ -298,8 +298,7 @@ def _lost(error: Exception) -> str:
     """Return why a test has no result if the cause may lie outside the test."""
     if isinstance(error, EndedError) or type(error).__name__ == "KilledWorker":  # raised by Dask
         return (
-            "its process ended in every attempt to fit it (killed, or out of memory); call again "
-            "to retry"
+            "its process ended before it was fitted (killed, or out of memory); call again to retry"
         )
     why = " ".join(f"{type(error).__name__}: {error}".split())
     return f"its fit was lost ({why}); call again to retry"
