@@ -234,14 +234,14 @@ def test_a_worker_that_dies_says_so(ready):
     assert ready.result is None
 
 
-def compiling(model):
+def compiling():
     """Compile for a minute; at module level so that it can be pickled."""
     time.sleep(60.0)
 
 
 def test_what_compiles_at_first_use_is_waited_for_and_ends_with_the_page(monkeypatch):
     monkeypatch.setattr(worker_module.cache, "compiled", lambda _: False)
-    monkeypatch.setattr(worker_module, "compile_solver", compiling)
+    monkeypatch.setattr(worker_module, "_compile", compiling)
     first_use = worker_module.FirstUse()
     wait(first_use, lambda one: one.process.pid is not None)
     assert not first_use.done.done()

@@ -7,6 +7,7 @@ point, as Ctrl-C does in a terminal.
 from __future__ import annotations
 
 import _thread
+import os
 import signal
 import threading
 import time
@@ -113,7 +114,7 @@ class FirstUse:
     """
 
     def __init__(self) -> None:
-        self.process = PROCESSES.Process(target=compile_solver, args=("auto",), daemon=True)
+        self.process = PROCESSES.Process(target=_compile, daemon=True)
         pool = ThreadPoolExecutor(1, thread_name_prefix="foamfit-compiling")
         self.done: Future[None] = pool.submit(self._compile)
 
@@ -128,7 +129,18 @@ class FirstUse:
             self.process.kill()
 
 
-# --------------------------------------------------------------------- in the process of the fit
+# ------------------------------------------------------------------------ in the other processes
+
+
+def _leave_terminal() -> None:
+    """Keep Ctrl-C in the terminal from this process: the server ends it."""
+    if hasattr(os, "setpgrp"):  # not on Windows
+        os.setpgrp()
+
+
+def _compile() -> None:
+    _leave_terminal()
+    compile_solver("auto")
 
 
 class _Teller(Watcher):
@@ -220,5 +232,6 @@ def _wait_for_stop(pipe: Connection) -> None:
 
 def run(job: Job, pipe: Connection) -> None:
     """Run a job; reports, and in the end its outcome, go to a pipe."""
+    _leave_terminal()
     with ending_cleanly():
         pipe.send(_fitted(job, _Teller(pipe)))
