@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -36,7 +35,6 @@ from foamfit.text import counted
 if TYPE_CHECKING:
     import pandas as pd
 
-_LOG = logging.getLogger(__name__)
 MOST_AHEAD = 1000  # tests submitted to the executor at a time
 PAUSE = 60.0  # least time between two summaries, s: of many tests, one takes seconds
 Tests = str | Path | Iterable[str | Path]
