@@ -81,9 +81,10 @@ class Task:
 def fingerprint(recipe: Recipe, path: Path, toml: Path) -> str:
     """Return a hash of everything that determines a result: settings, version and files."""
     try:
-        parts = [read_whole(path), *(one.read_bytes() for one in (toml,) if one.is_file())]
-        if (motion := motion_file(toml)) is not None and motion.is_file():
-            parts.append(motion.read_bytes())
+        parts = [read_whole(path)]
+        for other in (toml, motion_file(toml)):
+            if other is not None and other.is_file():
+                parts.append(other.read_bytes())
     except OSError:  # the fit reads the test again, with a better error message
         parts = []
     digests = (hashlib.sha256(part).hexdigest() for part in parts)
@@ -115,29 +116,34 @@ def work(task: Task) -> tuple[Row, ...]:
     """
     with _ALONE:
         laws.load_texts(task.recipe.laws)
-        seen = task.where.is_dir()
-        with chdir(task.where if seen else "."):
-            if not seen or fingerprint(task.recipe, task.path, task.toml) != task.fingerprint:
-                raise RuntimeError(
-                    f"{platform.node()} does not see the same files or has another version of "
-                    "foamfit; every worker must see the file system of the call"
-                )
-            rows, write = _fitted(task)
-            record = {
-                "schema": SCHEMA,
-                "foamfit": version("foamfit"),
-                "fingerprint": task.fingerprint,
-                "pages": task.recipe.pages,
-                "figure_width": inches(task.recipe.width),
-                "rows": plain(rows, {}),
-            }
+        if task.where.is_dir():
+            with chdir(task.where):
+                if fingerprint(task.recipe, task.path, task.toml) == task.fingerprint:
+                    return _written(task)
+    raise RuntimeError(
+        f"{platform.node()} does not see the same files or has another version of foamfit; every "
+        "worker must see the file system of the call"
+    )
 
-            def fill(folder: Path) -> None:
-                write(folder)
-                write_json(folder / RECORD, record)
 
-            save_whole(task.out, fill, swept=True)
-            return rows
+def _written(task: Task) -> tuple[Row, ...]:
+    """Fit one test, write its folder and return its rows."""
+    rows, write = _fitted(task)
+    record = {
+        "schema": SCHEMA,
+        "foamfit": version("foamfit"),
+        "fingerprint": task.fingerprint,
+        "pages": task.recipe.pages,
+        "figure_width": inches(task.recipe.width),
+        "rows": plain(rows, {}),
+    }
+
+    def fill(folder: Path) -> None:
+        write(folder)
+        write_json(folder / RECORD, record)
+
+    save_whole(task.out, fill, swept=True)
+    return rows
 
 
 Write = Callable[[Path], None]
