@@ -30,7 +30,6 @@ from foamfit.results import SCHEMA, Fit, Loop
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.joint_fit import Alternative, JointFit
-from foamfit.study.processes import JOINT, Processes, cores
 from foamfit.text import counted, number
 from foamfit.trust.covariance import RULE
 
@@ -39,8 +38,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Largest number of result folders written in this process: each takes a second or two.
-FEW_FOLDERS = 3
 _NOT_IN_FILE = ("loops", "fits", "fit")  # fields that joint.json does not contain
 MOST_ROWS = 60  # of the table of tests on the terminal
 MOST_LOOPS = 48
@@ -91,7 +88,7 @@ class JointResult(Result):
     sentences: tuple[str, ...] = ()
     runtime_s: float = math.nan
     loops: tuple[Loop, ...] = ()  #: Measured and fitted loop of each test
-    #: Result of each test, or a function that makes it and can run in any process
+    #: Result of each test, or a function that makes it
     fits: tuple[Fit | Callable[[], Fit], ...] = ()
     fit: JointFit | None = None  #: The fit itself; None if the result was read from its folder
 
@@ -163,13 +160,9 @@ class JointResult(Result):
         kinds = {name: one.kind for name, one in shown.items()}
         between = {name: _between(one) for name, one in shown.items()}
         write_text(folder / "table.tex", parameters_tex(shown, kinds=kinds, between=between))
-        folders, n = [folder / name for name in self.tests], len(self.tests)
-        work = self.fits, folders, [pages] * n, [width] * n
-        if pages and n > FEW_FOLDERS and cores() > 1:
-            with Processes(min(cores(), n), JOINT) as pool:
-                list(pool.map(_write_test, *work))
-        else:
-            list(map(_write_test, *work))
+        for name, one in self.results.items():
+            (folder / name).mkdir()
+            write_result(one, folder / name, pages=pages, width=width)
         if pages:
             svg = figures.write_both(plot_joint(self, width=width), folder / "joint")
             write_text(folder / "joint.html", joint_page(self, folder, svg))
@@ -183,11 +176,6 @@ class JointResult(Result):
         for one in shown["parameters"].values():
             one["state"] = one["state"] or None  # of an own parameter
         return shown
-
-
-def _write_test(one: Callable[[], Fit] | Fit, folder: Path, report: bool, width: str) -> None:
-    folder.mkdir()
-    write_result(one if isinstance(one, Fit) else one(), folder, pages=report, width=width)
 
 
 def _between(one: ParameterEstimate) -> str:

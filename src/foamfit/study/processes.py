@@ -25,10 +25,9 @@ from typing import Any
 
 from foamfit.terminal import without_ctrl_c
 
-# Modules that are imported by fits, by their pages and by the pages of a joint fit.
+# Modules that are imported by fits and by their pages.
 FITS = ("foamfit.study.batch_work", "foamfit.data.csv_file", "pandas", "pint")
 PAGES = ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf", "jinja2")
-JOINT = ("foamfit.study.joint", "foamfit.report.plots", *PAGES)
 # One thread per process, as there is one process per core.
 ONE_THREAD = {
     f"{name}_NUM_THREADS": "1"
