@@ -29,7 +29,7 @@ from foamfit.report.listing import REFUSED, Row, row_of
 from foamfit.springs import laws
 from foamfit.study.cycles import fit_cycles
 
-SCHEMA = 1
+SCHEMA, VERSION = 1, version("foamfit")
 RECORD = "batch.json"  # in the folder of each test: its rows, and the fingerprint of their inputs
 # One fit at a time per process, also in an executor with threads: drawing is not thread-safe.
 _ALONE = threading.Lock()
@@ -54,7 +54,7 @@ class Recipe:
     @property
     def key(self) -> str:
         """Settings and version that determine the results; `stored` checks pages and width."""
-        parts = asdict(replace(self, pages=True)) | {"foamfit": version("foamfit")}
+        parts = asdict(replace(self, pages=True)) | {"foamfit": VERSION}
         del parts["width"]
         texts = parts.pop("laws")
         if any(laws.is_registered(kind) for kind in self.model.split("+")):
@@ -131,7 +131,7 @@ def _written(task: Task) -> tuple[Row, ...]:
     rows, write = _fitted(task)
     record = {
         "schema": SCHEMA,
-        "foamfit": version("foamfit"),
+        "foamfit": VERSION,
         "fingerprint": task.fingerprint,
         "pages": task.recipe.pages,
         "figure_width": inches(task.recipe.width),
