@@ -235,8 +235,11 @@ def batch(
         sweep(folder.resolve(), [*(name for name, _ in found), *FILES["batch.json"]])
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {reason(error)}") from None
-    with _executor(executor, jobs, made) as runner:
-        made.fit(runner)
+    try:
+        with _executor(executor, jobs, made) as runner:
+            made.fit(runner)
+    finally:  # a process that was killed may have left half a folder
+        sweep(folder.resolve(), [name for name, _ in found])
     return tables.read_table(folder / "summary.csv")
 
 
@@ -285,11 +288,8 @@ def _executor(given: Executor | None, jobs: int | None, made: Batch) -> Iterator
         return
     precompile.compile_solver(made.recipe.model)
     count = min(jobs or cores(), max(len(made.tests), 1))
-    try:
-        with Processes(count, (*FITS, *(PAGES if made.recipe.pages else ()))) as pool:
-            yield pool
-    finally:
-        sweep(made.out.resolve(), [name for name, _ in made.tests])
+    with Processes(count, (*FITS, *(PAGES if made.recipe.pages else ()))) as pool:
+        yield pool
 
 
 def _lost(error: Exception) -> str:
