@@ -175,7 +175,7 @@ def thin_foams(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replace the pictures of result folders by files of a few bytes."""
-    monkeypatch.setattr(result_folder, "draw_all", lambda *_: fabricated.no_figures().items())
+    monkeypatch.setattr(result_folder, "figures_of", lambda *_: fabricated.no_figures())
 
 
 def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -496,9 +496,8 @@ def test_refuses_scenes(here: Path, text: str, words: tuple[str, ...]) -> None:
         (["--out", "."], ("is a folder",)),
         (["--rtol", "0"], ("--rtol", "1e-14<=x<=0.1")),
         (["--rtol", "nan"], ("rtol = nan", "between")),
-        (["--out", "scene.toml"], ("scene.toml is read by this command", "another file")),
-        (["--plot", "./scene.toml"], ("scene.toml is read by this command", "another file")),
-        (["--out", "a.png", "--plot", "a.png"], ("a.png", "two")),
+        (["--out", "scene.toml"], ("scene.toml exists and is not a response", "another name")),
+        (["--plot", "./scene.toml"], (".png, .pdf or .svg, not 'scene.toml'",)),
     ],
 )
 def test_refuses_calls_of_simulate(here: Path, args: list[str], words: tuple[str, ...]) -> None:
@@ -508,7 +507,9 @@ def test_refuses_calls_of_simulate(here: Path, args: list[str], words: tuple[str
 def test_simulate_keeps_the_history_that_drives_it(here: Path) -> None:
     (here / "drive.csv").write_text("time (ms),stress (MPa)\n0,0\n1,1\n2,0\n")
     path = scene(here, OWN + DRIVE).rename(here / "drive.toml")  # without --out: drive.csv
-    refused(here, "simulate", path, words=("drive.csv is read by this command", "another file"))
+    refused(
+        here, "simulate", path, words=("drive.csv exists and is not a response", "another name")
+    )
     accepted("simulate", path, "--out", "response.csv")
 
 
@@ -523,7 +524,7 @@ def test_compare_and_fit_keep_what_they_read(here: Path, fitted: tuple[Path, Res
     folder = here / "old"
     shutil.copytree(next(fitted[0].rglob("fit.json")).parent, folder)
     args = ("--published", "foam-1/model-1", "--plot", folder / "fit.json")
-    refused(here, "compare", folder, *args, words=("fit.json is read by this command",))
+    refused(here, "compare", folder, *args, words=(".png, .pdf or .svg, not 'fit.json'",))
     write(folder)
     refused(here, "fit", folder / "test.csv", "--out", folder, words=("old holds test.csv",))
 

@@ -221,7 +221,7 @@ def test_an_older_result_that_a_killed_process_put_aside_comes_back(
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError
 
-    monkeypatch.setattr(foamfit.report.folder, "draw_all", fail)
+    monkeypatch.setattr(foamfit.report.folder, "figures_of", fail)
     with pytest.raises(RuntimeError):
         fabricated.result(seed=2).save("r")
     assert load_result("r")["seed"] == 1

@@ -1,4 +1,4 @@
-"""The portable ways beside POSIX signals and fork servers, tried here as on Windows."""
+"""Signals and processes that also Windows has, tried here."""
 
 import multiprocessing
 import os
@@ -8,32 +8,16 @@ import sys
 
 import pytest
 
-from foamfit import system
+from foamfit import terminal
 from foamfit.study.processes import Processes
 
 PAGE = """
-from foamfit import system
-system.POSIX = False
 from foamfit.page.server import serve
 serve(None, 0, browser=False)
 """
 
 
-@pytest.fixture
-def portable(monkeypatch):
-    monkeypatch.setattr(system, "POSIX", False)
-
-
-def test_a_process_that_was_started_apart_is_killed(portable):
-    process = subprocess.Popen(
-        [sys.executable, "-c", "import time; time.sleep(60)"], **system.apart()
-    )
-    system.end_all(process)
-    assert process.returncode != 0
-    system.end_all(process)  # again, after its end
-
-
-def test_the_page_ends_cleanly_without_signal_handlers_of_the_loop(tmp_path):
+def test_the_page_ends_cleanly(tmp_path):
     pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
     process = subprocess.Popen(
         [sys.executable, "-c", PAGE], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -54,11 +38,11 @@ def test_processes_without_a_fork_server_are_spawned(monkeypatch):
 
 def test_no_other_module_uses_what_windows_lacks():
     lacking = ("SIGHUP", "killpg", "add_signal_handler", "start_new_session", "os.fork(")
-    root = os.path.dirname(system.__file__)
+    root = os.path.dirname(terminal.__file__)
     for folder, _, files in os.walk(root):
         for name in files:
             path = os.path.join(folder, name)
-            if name.endswith(".py") and path != system.__file__:
+            if name.endswith(".py") and path != terminal.__file__:
                 with open(path, encoding="utf-8") as file:
                     text = file.read()
                 assert not [word for word in lacking if word in text], path

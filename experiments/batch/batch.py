@@ -24,7 +24,7 @@ import numpy as np
 
 import foamfit as ff
 from foamfit.study import batch_work
-from foamfit.study.batch_work import Recipe, Task, fingerprint, put, stored, work
+from foamfit.study.batch_work import Recipe, Task, fingerprint, stored, work
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
@@ -101,11 +101,9 @@ def measure_speedup(place: Path, *words: str) -> dict[str, Any]:
     }
 
 
-def task(path: Path, toml: Path, recipe: Recipe, out: Path | None) -> Task:
-    """Return a test as the command hands it to a process; without `out` with its content."""
-    content = path.read_bytes(), toml.read_bytes(), None
-    mark = fingerprint(recipe.key, *content)
-    return Task(path.stem, path, toml, recipe, mark, out, None if out else content)
+def task(path: Path, toml: Path, recipe: Recipe, out: Path) -> Task:
+    """Return a test as the command hands it to a process."""
+    return Task(path.stem, path, toml, recipe, fingerprint(recipe, path, toml), out)
 
 
 def measure_overhead(place: Path) -> dict[str, Any]:
@@ -161,22 +159,18 @@ def measure_parts(place: Path) -> dict[str, Any]:
     toml, paths, found = place / "foam.toml", sorted((place / "tests").iterdir()), {}
     for name, pages in {"no report": False, "reports": True}.items():
         recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=pages)
-        first, out = task(paths[0], toml, recipe, None), place / name
-        files = work(first)[1]
-        assert files is not None
+        first = task(paths[0], toml, recipe, place / name)
+        work(first)
+        files = [path.stat().st_size for path in first.out.iterdir()]
         began = time.process_time()
         for path in paths:
-            put(files, out / path.stem)
-        written = time.process_time()
-        for path in paths:
-            fingerprint(recipe.key, path.read_bytes(), toml.read_bytes(), None)
-            stored(out / path.stem, first.fingerprint, recipe)
-        again = time.process_time()
+            fingerprint(recipe, path, toml)
+            stored(first.out, first.fingerprint, recipe)
+        again = time.process_time() - began
         found[name] = {
             "files": len(files),
-            "kB": sum(map(len, files.values())) / 1e3,
-            "write_ms": 1e3 * (written - began) / len(paths),
-            "again_ms": 1e3 * (again - written) / len(paths),
+            "kB": sum(files) / 1e3,
+            "again_ms": 1e3 * again / len(paths),
         }
     return found
 

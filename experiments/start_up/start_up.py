@@ -46,13 +46,11 @@ import foamfit
 test = foamfit.read_test(sys.argv[1])
 marks.append(time.perf_counter())
 from foamfit import api
-from foamfit.cli.options import drawing
-with drawing(True) as mapped:
-    marks.append(time.perf_counter())
-    result = api.fit(test)
-    marks.append(time.perf_counter())
-    result.save(sys.argv[2], mapped=mapped)
-    marks.append(time.perf_counter())
+marks.append(time.perf_counter())
+result = api.fit(test)
+marks.append(time.perf_counter())
+result.save(sys.argv[2])
+marks.append(time.perf_counter())
 print(*(after - before for before, after in zip(marks, marks[1:])))
 gc.freeze()  # as in the command
 """

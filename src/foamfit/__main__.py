@@ -2,4 +2,5 @@
 
 from foamfit.cli import main
 
-main(prog_name="foamfit")
+if __name__ == "__main__":  # not in the processes that the page starts
+    main(prog_name="foamfit")

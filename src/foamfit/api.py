@@ -6,6 +6,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Unpack
 
 import lmfit
+import numpy as np
 from lmfit import Minimizer
 from lmfit.minimizer import MinimizerResult
 
@@ -15,7 +16,7 @@ from foamfit.errors import InputError
 from foamfit.fitting.minimizer import minimizer_of, result_of
 from foamfit.one_model import SEARCHED, Options, Progress, identify, judge
 from foamfit.options import Keywords, documented
-from foamfit.report.folder import dataset, write_result
+from foamfit.report.folder import write_result
 from foamfit.report.plots import draw_panel
 from foamfit.report.readable import readable
 from foamfit.report.shown import Result, brief
@@ -24,6 +25,7 @@ from foamfit.report.tables import frame
 from foamfit.results import Fit
 from foamfit.solve.precompile import compile_solver
 from foamfit.springs.model import Model
+from foamfit.springs.parameters import unit_of
 from foamfit.text import percent
 from foamfit.trust.intervals import Announce
 
@@ -72,15 +74,25 @@ class FitResult(Result, Fit):
 
         Raises InputError if xarray is not installed.
         """
-        about = {"test": self.measurement.name, "model": self.words}
-        return dataset(self.draws, **about) if self.draws else None
+        if not self.draws:
+            return None
+        try:
+            import xarray
+        except ImportError:
+            raise InputError(
+                'samples need xarray, which is not installed; pip install "foamfit[mcmc]"'
+            ) from None
+        dims, about = ("chain", "draw"), {"test": self.measurement.name, "model": self.words}
+        columns = {n: (dims, x, {"units": unit_of(n) or "1"}) for n, x in self.draws.items()}
+        sizes = zip(dims, next(iter(self.draws.values())).shape, strict=True)
+        return xarray.Dataset(columns, {dim: np.arange(size) for dim, size in sizes}, about)
 
-    def _shown(self, *, html: bool = False) -> str:
+    def __repr__(self) -> str:
         """Return status, model, misfit and parameters."""
         misfits = ", ".join(f"{name} {percent(misfit)}" for name, misfit in compared(self).items())
         line = f"{self.law}, {self.drive} drive · status {self.status} · misfit: {misfits or '–'}"
         rows = [readable(name, p) for name, p in self.parameters.items() if p.state != "fixed"]
-        return brief(self.measurement.name, line, rows, html)
+        return brief(self.measurement.name, line, rows)
 
 
 @documented

@@ -10,6 +10,7 @@ import types
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, fields, is_dataclass
+from functools import cache
 from pathlib import PurePath
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -116,13 +117,19 @@ def build(made: Any, content: Mapping[str, Any], columns: Columns, **names: Any)
     `names` are the names in its annotations that its module imports for typing only. Raises
     KeyError, TypeError, ValueError or AttributeError if a field is missing or invalid.
     """
-    hints = get_type_hints(made, localns=names)
+    hints = get_type_hints(made, localns=names) if names else _hints(made)
     given = {}
     for one in fields(made):
         missing = one.default is MISSING and one.default_factory is MISSING
         if missing or one.name in content:
             given[one.name] = decode(hints[one.name], content[one.name], columns)
     return made(**given)
+
+
+@cache
+def _hints(made: Any) -> dict[str, Any]:
+    """Return the types of a dataclass's fields; finding them takes most of the time of `build`."""
+    return get_type_hints(made)
 
 
 def _parameters(params: Any, content: Mapping[str, Any]) -> Any:

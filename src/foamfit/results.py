@@ -284,7 +284,7 @@ class Fit:
 
     def __post_init__(self) -> None:
         """Set the correlations of lmfit's parameters."""
-        if self.correlation is None or self.params is None:  # the figures need no parameters
+        if self.correlation is None:
             return
         names = self.correlation.names
         for name, row in zip(names, self.correlation.matrix, strict=True):

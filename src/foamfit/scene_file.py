@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +37,8 @@ _MOST_SAMPLES = 1_000_000
 RESPONSE = "time (s),base stress (Pa),strain"
 
 
-def _any(si: str, example: str) -> Quantity:
-    """Check of a quantity whose sign the chain or the drive checks."""
-    return Quantity(si, example, positive=False)
+# Check of a quantity whose sign the chain or the drive checks.
+_any = partial(Quantity, positive=False)
 
 
 def _of(param: Param) -> Quantity:
@@ -101,26 +100,10 @@ def read_scene(path: Path) -> tuple[Chain, Drive, Array]:
     return chain, StressDrive(values) if kind == "stress" else DisplacementDrive(values), time
 
 
-def files_of_scene(path: Path) -> tuple[Path, ...]:
-    """Return the path of the scene file and, if it names one, of the file of its drive."""
-    drive = load_toml(path, "give the TOML file of a scene").get("drive")
-    file = drive.get("file") if isinstance(drive, dict) else None
-    return (path, path.parent / file) if isinstance(file, str) else (path,)
-
-
 def _table(document: dict[str, Any], name: str) -> dict[str, Any]:
     if not isinstance(document.get(name), dict):
         raise InputError(f"the table [{name}] is missing; see foamfit simulate --help.")
     return document[name]  # type: ignore[no-any-return]
-
-
-@contextmanager
-def _placed(where: str) -> Iterator[None]:
-    """Put a place in the file in front of an InputError raised by the body."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{where} {error}.") from None
 
 
 def _chain(table: dict[str, Any]) -> Chain:
@@ -135,14 +118,14 @@ def _chain(table: dict[str, Any]) -> Chain:
     if not isinstance(tables, list) or not tables or not all(isinstance(t, dict) for t in tables):
         raise InputError("[chain] needs springs, each under [[chain.springs]], base first.")
     springs, heights, masses = zip(*(_spring(t, i) for i, t in enumerate(tables, 1)), strict=True)
-    with _placed("[chain]"):
+    with naming("[chain]"):
         return Chain(springs, heights, area, masses, site_damping=found.get("site_damping", 0.0))
 
 
 def _spring(table: dict[str, Any], number: int) -> tuple[Spring, float, float]:
     """Return a spring, its height, m, and the mass above it, kg."""
-    where = f"[chain] spring {number}:"
-    law = laws.law(_one_of(laws.kinds())(table.get("kind"), f"{where} kind"))
+    where = f"[chain] spring {number}"
+    law = laws.law(_one_of(laws.kinds())(table.get("kind"), f"{where}: kind"))
     extra = max(law.options, key=len, default=())  # all parameters that options can free
     wide = laws.law(laws.with_options(law.kind, extra))
     law = wide if set(wide.own) - set(law.own) & set(table) else law
@@ -150,16 +133,16 @@ def _spring(table: dict[str, Any], number: int) -> tuple[Spring, float, float]:
     keys |= {name: _of(param) for name, param in law.by_name.items()}
     keys |= {"relaxation": _RELAXATION} if law.hysteretic else {}
     needed = [name for name, param in law.by_name.items() if param.neutral is None]
-    found = checked(table, keys, where, [*needed, "height"])
+    found = checked(table, keys, f"{where}:", [*needed, "height"])
     values: list[Any] = [found.get(name, param.neutral) for name, param in law.by_name.items()]
     terms = [(term["g"], term["tau"]) for term in found.get("relaxation", ())]
-    with _placed(where):
+    with naming(where):
         return law.make(values, terms), found["height"], found.get("mass", 0.0)
 
 
 def _impact(table: dict[str, Any]) -> Impact:
     found = checked(table, _IMPACT, "[drive]", ["mass", "velocity"])
-    with _placed("[drive]"):
+    with naming("[drive]"):
         return Impact(found["mass"], found["velocity"], found.get("gravity", 0.0))
 
 

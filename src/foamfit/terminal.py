@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import codecs
 import os
 import re
 import signal
 import sys
 import threading
-import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import TextIOWrapper
@@ -16,14 +14,14 @@ from types import FrameType
 from typing import Any, TextIO
 
 from foamfit.errors import InputError
-from foamfit.system import ENDING
 
+# Signals that ask a process to end: Ctrl-C, `kill`, and on POSIX the end of the terminal.
+ENDING = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
 # Control characters except tab and new line, and characters that reverse the direction of writing:
 # in a file name they could move the cursor or hide text. Also surrogates (non-UTF-8 bytes).
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-# Replacements of characters that an encoding lacks; Greek letters are spelled out.
-_PAIRS = "−- –- ±+/- ·* …... →-> √sqrt µu ²^2 ³^3 ⁻^- ¹1 ∂d"
-_INSTEAD = {pair[0]: pair[1:] for pair in _PAIRS.split()}
 
 
 def printable(text: str) -> str:
@@ -31,29 +29,10 @@ def printable(text: str) -> str:
     return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
 
 
-def _instead(error: UnicodeError) -> tuple[str, int]:
-    """Replace characters that an encoding lacks by ASCII; an error handler for `codecs`."""
-    assert isinstance(error, UnicodeEncodeError)
-    told = ""
-    for character in error.object[error.start : error.end]:
-        match unicodedata.name(character, "").split():
-            case ["GREEK", size, "LETTER", letter]:
-                told += letter.lower() if size == "SMALL" else letter.capitalize()
-            case ["COMBINING", *_]:
-                pass
-            case _:
-                told += _INSTEAD.get(character, "?")
-    return told, error.end
-
-
-codecs.register_error("foamfit.instead", _instead)
-
-
 def show_all() -> None:
-    """Make stdout and stderr replace characters that their encoding lacks instead of failing."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper) and stream.errors != "foamfit.instead":
-            stream.reconfigure(errors="foamfit.instead")
+    """Make stdout escape characters that its encoding lacks instead of failing, like stderr."""
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def say(text: str, *, err: bool = False, newline: bool = True) -> None:

@@ -11,7 +11,7 @@ from foamfit.data.csv_file import read_test
 from foamfit.data.frames import Frames, join
 from foamfit.data.measurement import Record
 from foamfit.fitting.problem import make_problem
-from foamfit.study.batch_work import fingerprint
+from foamfit.study.batch_work import Recipe, fingerprint
 from foamfit.study.study_file import find_tests
 
 LAST = 4e-3  # s
@@ -162,9 +162,10 @@ def test_the_digest_covers_both_files(tmp_path):
     camera = tmp_path / "camera.csv"
     camera.write_text(camera.read_text() + "\n")
     assert read_test(path).data_sha256 != first
-    before = fingerprint("key", b"a", b"b", b"c")
-    assert before != fingerprint("key", b"a", b"b", b"d")
-    assert before != fingerprint("key", b"a", b"b", None)
+    recipe, toml = Recipe("bistable", {}), path.with_name("test.toml")
+    before = fingerprint(recipe, path, toml)
+    (path.parent / "camera.csv").unlink()
+    assert fingerprint(recipe, path, toml) != before
 
 
 def test_a_motion_is_no_test_of_its_own(tmp_path):

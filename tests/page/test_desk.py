@@ -4,7 +4,7 @@ import io
 import json
 import os
 import signal
-import sys
+import threading
 import time
 import tomllib
 import zipfile
@@ -53,15 +53,14 @@ class Here(Worker):
 
     def __init__(self, job):
         self.job, self.news, self.told, self.stopping = job, News(), "", False
-        self._errors = io.BytesIO()
-        given, told = io.StringIO(json.dumps(vars(job)) + "\n"), io.StringIO()
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sys, "stdin", given)
-            patch.setattr(sys, "stdout", told)
-            worker_module.main()
-        told.seek(0)
-        self.process = SimpleNamespace(stdin=given, stdout=told, wait=lambda: 0, poll=lambda: 0)
-        self._listen()
+        self.ended = None
+        self._pipe, there = worker_module.PROCESSES.Pipe()
+        self.process = SimpleNamespace(join=lambda: None, kill=lambda: None)
+        threading.Thread(target=self._listen, daemon=True).start()
+        with there:
+            there.send(worker_module._fitted(job, worker_module._Teller(there)))
+            while self.ended is None:
+                time.sleep(0.01)
 
 
 @pytest.fixture
@@ -235,33 +234,19 @@ def test_a_worker_that_dies_says_so(ready):
     assert ready.result is None
 
 
-@pytest.mark.parametrize(
-    ("code", "errors", "told"),
-    [
-        (-signal.SIGINT, "", "stopped before it had a result"),
-        (1, "Traceback …\nKeyboardInterrupt", "stopped before it had a result"),
-        (1, "Traceback …\nMemoryError", "has died with exit code 1 (MemoryError)"),
-        (-signal.SIGKILL, "", "has died by SIGKILL"),
-    ],
-)
-def test_a_worker_that_dies_while_it_is_stopped_says_what_it_was(code, errors, told):
-    worker = Worker.__new__(Worker)
-    worker.stopping, worker._errors = True, io.BytesIO(errors.encode())
-    assert told in worker._why(code)
+def compiling():
+    """Compile for a minute; at module level so that it can be pickled."""
+    time.sleep(60.0)
 
 
 def test_what_compiles_at_first_use_is_waited_for_and_ends_with_the_page(monkeypatch):
     monkeypatch.setattr(worker_module.cache, "compiled", lambda _: False)
-    monkeypatch.setattr(worker_module, "COMPILE", "import time; time.sleep(60)  # {}")
+    monkeypatch.setattr(worker_module, "_compile", compiling)
     first_use = worker_module.FirstUse()
-    integrator, memory = first_use.parts
-    assert first_use.needed("linear+bistable", 0) is integrator
-    needing = [("auto", 0), ("microscale", 0), ("bistable", 1)]
-    assert {first_use.needed(*one) for one in needing} == {memory}
-    wait(first_use, lambda one: one._process is not None)
-    assert not integrator.done()
+    wait(first_use, lambda one: one.process.pid is not None)
+    assert not first_use.done.done()
     first_use.close()
-    assert integrator.result(timeout=30.0) is memory.result(timeout=30.0) is None
+    assert first_use.done.result(timeout=30.0) is None
 
 
 @pytest.mark.usefixtures("without_process")

@@ -55,7 +55,7 @@ def test_the_page_needs_nothing_else() -> None:
     text = render_report(fabricated.result())
     whole = Page(text)
     assert whole.open == []  # every tag is closed, in order
-    assert len(whole.references) == 2  # the fit figure for large screens and for phones
+    assert len(whole.references) == 1  # the figure of the fit
     assert all(ref.startswith("data:image/svg+xml;base64,") for ref in whole.references)
     assert not re.search(r"@import|url\(|<link|<script", text)
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)

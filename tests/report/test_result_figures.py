@@ -1,57 +1,27 @@
-"""Figures of a result are the same in any process and need few imports."""
+"""Figures of a result, and the imports of the command."""
 
 from __future__ import annotations
 
 import json
 import subprocess
 import sys
-from concurrent.futures import Future
+from pathlib import Path
 from typing import Any
 
-import pytest
-
 import fabricated
-import foamfit.study.processes
 from conftest import EXPERIMENTS
-from foamfit.cli.options import drawing
-from foamfit.report.result_figures import Images, draw_all
-from foamfit.study.processes import EndedError
+from foamfit.report.figures import image
+from foamfit.report.result_figures import figures_of
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 
 
-@pytest.fixture(scope="module")
-def drawn_here() -> dict[str, Images | None]:
-    return dict(draw_all(fabricated.result()))
-
-
-def test_other_processes_draw_the_same(drawn_here: dict[str, Images | None]) -> None:
-    with drawing(True) as mapped:
-        assert dict(draw_all(fabricated.result(), mapped=mapped)) == drawn_here
-    fit = drawn_here["fit"]
-    assert fit is not None
-    assert fit.png.startswith(b"\x89PNG")
-    assert fit.pdf.startswith(b"%PDF")
-    shown = drawn_here["shown"]
-    assert shown is not None
-    assert b"stress (MPa)</text>" in shown.svg
-
-
-@pytest.mark.parametrize(
-    "error", [EndedError("its process ended 2 times"), ImportError("no functioning sem_open")]
-)
-def test_where_processes_end_this_one_draws(
-    monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
-    def ended(*_: Any) -> Future[Any]:
-        told: Future[Any] = Future()
-        told.set_exception(error)
-        return told
-
-    monkeypatch.setattr(foamfit.study.processes.Processes, "submit", ended)
-    monkeypatch.setattr(foamfit.study.processes, "cores", lambda: 2)
-    with drawing(True) as mapped:
-        assert list(mapped(str.upper, ["fit", "shown"])) == ["FIT", "SHOWN"]
+def test_the_figure_of_a_fit_is_a_picture_and_has_text(tmp_path: Path) -> None:
+    folder = fabricated.result().save(tmp_path / "r")
+    assert (folder / "fit.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "fit.pdf").read_bytes().startswith(b"%PDF")
+    svg = image(figures_of(fabricated.result())["fit"], "svg")
+    assert b"stress (MPa)</text>" in svg
 
 
 def a_process(code: str, *arguments: str) -> tuple[str, set[str]]:
@@ -65,11 +35,6 @@ def a_process(code: str, *arguments: str) -> tuple[str, set[str]]:
     return printed, set(modules.split())
 
 
-def test_drawing_imports_no_fit() -> None:
-    _, there = a_process("import foamfit.report.result_figures")
-    assert not there & {"lmfit", "pandas", "scipy.stats", "scipy.optimize", "numba"}
-
-
 def test_the_command_imports_what_a_fit_uses_and_prints_nothing_else(tmp_path: Any) -> None:
     call = ["fit", str(RECONSTRUCTION), "--out", str(tmp_path / "r"), "--starts", "2", "--json"]
     code = "from foamfit.cli import main\nmain(sys.argv[1:])"
@@ -78,4 +43,4 @@ def test_the_command_imports_what_a_fit_uses_and_prints_nothing_else(tmp_path: A
     assert (tmp_path / "r" / "fit.png").stat().st_size > 10_000
     assert (tmp_path / "r" / "fit.pdf").read_bytes().startswith(b"%PDF")
     assert "lmfit" in there
-    assert not there & {"matplotlib.figure", "fontTools", "unittest.mock"}
+    assert "unittest.mock" not in there

@@ -201,7 +201,7 @@ def test_a_test_that_kills_its_process_is_a_row_and_is_tried_again_when_called(
 ):
     monkeypatch.setattr(module, "work", failing)
     frame = again(executor=None, jobs=2).set_index("test")
-    assert "its process ended in every attempt" in frame.loc["b", "error"]
+    assert "its process ended before it was fitted" in frame.loc["b", "error"]
     assert list(numbers("out")) == ["a", "c"]
     assert not [name for name in names("out") if name.startswith(".")]
     before = stamps("out")
@@ -343,7 +343,7 @@ def test_killed_and_called_again_nothing_is_lost_or_done_twice(here, tried, monk
     psutil.wait_procs(others, timeout=20)
     assert not any(map(alive, others))
     done = stamps("out")
-    monkeypatch.setattr(module, "Processes", lambda *_: Local())
+    monkeypatch.setattr(module, "Processes", lambda *_: Inline())
     result = run(*words, "--jobs", "1")
     assert result.exit_code == 2  # bad.csv
     assert {*tried} == {"a", "b", "c"} - {*done}
@@ -355,7 +355,7 @@ def test_killed_and_called_again_nothing_is_lost_or_done_twice(here, tried, monk
 
 
 def test_the_command_prints_counts_parameters_and_refusals(here, tried, monkeypatch):
-    monkeypatch.setattr(module, "Processes", lambda *_: Local())
+    monkeypatch.setattr(module, "Processes", lambda *_: Inline())
     result = run("batch", "tests", "--specimen", "foam.toml", "--no-report", "--out", "out")
     assert result.exit_code == 2
     assert result.stdout.startswith("4 tests: 3 fitted with warnings and 1 refused\n")
@@ -371,13 +371,6 @@ def test_the_command_prints_counts_parameters_and_refusals(here, tried, monkeypa
     assert result.stderr == ""
 
 
-class Local(Inline):
-    """Executor that works in this process."""
-
-    def stop(self):
-        """Do nothing: there is no process to stop."""
-
-
 def test_a_scheduler_that_cannot_be_reached_is_one_sentence(here, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(command, "PATIENCE", 0.3)
@@ -390,9 +383,21 @@ def test_a_scheduler_that_cannot_be_reached_is_one_sentence(here, monkeypatch):
     assert not Path("out").exists()
 
 
+def test_a_worker_that_sees_other_files_is_a_row(here, tried):
+    class Elsewhere(Inline):
+        def submit(self, fn, task):
+            return super().submit(fn, replace(task, where=here / "elsewhere"))
+
+    (here / "elsewhere").mkdir()
+    row = again(executor=Elsewhere()).set_index("test").loc["a"]
+    assert row["status"] == "refused"
+    assert "does not see the same files" in row["error"]
+    assert not tried
+
+
 @posix
 def test_a_dask_cluster_loses_a_worker_and_no_test(here):
-    """Two workers without access to this file system; one is killed during the batch."""
+    """Two workers in another folder; one is killed during the batch."""
     distributed = pytest.importorskip("distributed")
     (here / "tests/bad.csv").unlink()
     (here / "elsewhere").mkdir()

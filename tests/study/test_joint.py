@@ -1,9 +1,7 @@
 """Joint fits of several tests, from files and a STUDY.toml as a user writes them."""
 
 import json
-import pickle
 import re
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +64,7 @@ SHARED = '\ns1_spread_plus = "shared"\ns1_spread_minus = "shared"\ns1_eps_star =
 @pytest.fixture(scope="module")
 def found(folder):
     parameters = 's1_k0 = "shared"\ns1_kc = "scatter"\ns1_sigma_plus = "log rate"' + SHARED
-    return ff.joint(write_study(folder, parameters), jobs=1)
+    return ff.joint(write_study(folder, parameters))
 
 
 def test_kinds_are_what_the_study_says(found):
@@ -173,13 +171,13 @@ def unlike(tmp_path_factory):
     for i, z in enumerate(deviates):
         write_test(here, f"t{i}", seed=i, noise=0.1 * NOISE, k0=5.5e5 * (1.0 + 0.05 * z))
     study = write_study(here, "\n".join(f'{name} = "shared"' for name in NAMES))
-    return ff.joint(study, jobs=1), 5.5e5 * 0.05 * np.std(deviates, ddof=1) / 5**0.5
+    return ff.joint(study), 5.5e5 * 0.05 * np.std(deviates, ddof=1) / 5**0.5
 
 
 def test_the_range_of_a_shared_value_holds_that_of_a_mean_over_other_specimens(unlike):
     joint, error = unlike
     k0 = joint.parameters["s1_k0"]
-    low, high = joint_fit._over_specimens(joint.fit.found, map)["s1_k0"]
+    low, high = joint_fit._over_specimens(joint.fit.found)["s1_k0"]
     assert 0.5 * (high - low) == pytest.approx(stats.t.ppf(0.975, 4) * error, rel=0.3)
     assert low < 5.5e5 < high
     assert k0.range[0] <= low < high <= k0.range[1]
@@ -191,7 +189,7 @@ def test_the_range_of_a_shared_value_holds_that_of_a_mean_over_other_specimens(u
 
 def test_evidence_chooses_a_kind(folder):
     parameters = '\ns1_sigma_plus = "auto"\ns1_k0 = "auto"\ns1_kc = "own"' + SHARED
-    chosen = ff.joint(write_study(folder, parameters), jobs=1)
+    chosen = ff.joint(write_study(folder, parameters))
     assert chosen.parameters["s1_sigma_plus"].kind in ("log rate", "power rate")
     assert chosen.parameters["s1_k0"].kind == "shared"
 
@@ -202,40 +200,16 @@ def test_a_law_of_rate_is_no_kind_where_the_rates_span_too_little(tmp_path):
     for i, (rate, k0) in enumerate(zip(rates, (5.1e5, 5.6e5, 5.4e5, 5.8e5, 5.9e5), strict=True)):
         write_test(tmp_path, f"t{i}", rate=rate, seed=i, k0=k0)
     rest = "".join(f'\n{name} = "shared"' for name in NAMES if name != "s1_k0")
-    one = ff.joint(write_study(tmp_path, 's1_k0 = "auto"' + rest), jobs=1)
+    one = ff.joint(write_study(tmp_path, 's1_k0 = "auto"' + rest))
     assert one.parameters["s1_k0"].kind == "own"
     assert {other.kind for other in one.evidence} == {"shared", "own"}
     (told,) = (sentence for sentence in one.sentences if "No rate law" in sentence)
     assert re.search(
         r"was tried for s1_k0: over 0\.0985 to 0\.102 1/s, the values .* within ±[1-9]", told
     )
-    named = ff.joint(write_study(tmp_path, 's1_k0 = "power rate"' + rest), jobs=1)
+    named = ff.joint(write_study(tmp_path, 's1_k0 = "power rate"' + rest))
     (told,) = (warning for warning in named.warnings if "a rate law needs more" in warning)
     assert told.startswith("s1_k0 (power rate): its own values in the tests, at 0.0985 to 0.102")
-
-
-def test_what_goes_to_other_processes_gives_the_same_numbers(folder, found, monkeypatch):
-    """Arguments and results pass through `pickle` on their way to and from a process."""
-    sent = []
-
-    @contextmanager
-    def elsewhere(*_):
-        def each(function, *work):
-            for items in zip(*work, strict=True):
-                sent.append(function.__name__)
-                there, given = pickle.loads(pickle.dumps((function, items)))
-                yield pickle.loads(pickle.dumps(there(*given)))
-
-        yield each
-
-    monkeypatch.setattr("foamfit.study.joint.workers", elsewhere)
-    parameters = 's1_k0 = "shared"\ns1_kc = "scatter"\ns1_sigma_plus = "log rate"' + SHARED
-    again = ff.joint(write_study(folder, parameters))
-    assert set(sent) == {"_own_fit", "curve_errors"}
-    one, two = found.to_json_dict(), again.to_json_dict()
-    for content in (one, two):
-        del content["runtime_s"]
-    assert one == two
 
 
 def test_a_noisy_test_does_not_dominate(tmp_path):
@@ -246,7 +220,7 @@ def test_a_noisy_test_does_not_dominate(tmp_path):
     (tmp_path / "noisy.toml").write_text(specimen.replace(f"{NOISE} Pa", f"{10 * NOISE} Pa"))
     study.write_text(study.read_text().replace("[parameters]",
                      '[specimens]\nt3 = "noisy.toml"\n[parameters]'))  # fmt: skip
-    result = ff.joint(study, jobs=1)
+    result = ff.joint(study)
     shares = [one.chi2_share for one in result.tests.values()]
     assert shares == pytest.approx([0.25] * 4, abs=0.06)
     one = result.parameters["s1_k0"]
@@ -281,7 +255,7 @@ def test_drives_and_noise_mix(tmp_path):
         'tests = ["*.csv"]\nmodel = "bistable"\nstarts = 2\n[parameters]\n'
         + "\n".join(f's1_{name} = "shared"' for name in (*names, "eta"))
     )
-    result = ff.joint(study, jobs=1)
+    result = ff.joint(study)
     assert result.drive is None
     assert [one["drive"] for one in result.to_json_dict()["tests"].values()] == [
         "impact", "displacement",
@@ -300,7 +274,7 @@ def test_the_command_writes_and_prints(folder, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
     monkeypatch.setattr(joint_report.figures, "write_both", few_bytes)
     study = write_study(folder, 's1_k0 = "shared"\ns1_kc = 4e5' + SHARED)
-    result = run("joint", study, "--out", tmp_path / "out", "--jobs", 1)
+    result = run("joint", study, "--out", tmp_path / "out")
     assert result.exit_code == 0
     assert "3 tests together" in result.stdout
     assert "t9.csv is left out" in result.stdout
@@ -308,11 +282,11 @@ def test_the_command_writes_and_prints(folder, tmp_path, monkeypatch):
     content = json.loads((tmp_path / "out" / "joint.json").read_text())
     assert content["parameters"]["s1_kc"]["kind"] == "fixed"
     assert content["parameters"]["s1_kc"]["value"] == 4e5
-    again = run("joint", study, "--out", tmp_path / "out", "--jobs", 1, "--json", "--no-report")
+    again = run("joint", study, "--out", tmp_path / "out", "--json", "--no-report")
     assert again.exit_code == 0
     assert json.loads(again.stdout)["seed"] == 0
     (tmp_path / "out" / "t1" / "mine.txt").write_text("mine")
-    kept = run_refused("joint", study, "--out", tmp_path / "out", "--jobs", 1)
+    kept = run_refused("joint", study, "--out", tmp_path / "out")
     assert "holds t1, which foamfit did not write" in kept
 
 
@@ -359,7 +333,7 @@ def test_one_number_may_be_all_that_is_fitted(tmp_path):
     (tmp_path / "study.toml").write_text(study.replace('"microscale"', '"linear"'))
     for i in range(2):
         write_test(tmp_path, f"t{i}", seed=i)
-    k0 = ff.joint(tmp_path / "study.toml", jobs=1).parameters["s1_k0"]
+    k0 = ff.joint(tmp_path / "study.toml").parameters["s1_k0"]
     assert k0.kind == "shared"
     assert k0.ci95[0] < k0.value < k0.ci95[1]
     assert k0.range[0] < k0.value < k0.range[1]

@@ -49,7 +49,7 @@ def fit_together(folder: Path, seed: int):
     (folder / "study.toml").write_text(
         f'tests = ["t*.csv"]\nmodel = "bistable"\nstarts = 2\n[parameters]\n{shared}\n'
     )
-    return records, ff.joint(folder / "study.toml", jobs=1)
+    return records, ff.joint(folder / "study.toml")
 
 
 @pytest.fixture(scope="module")

@@ -123,7 +123,7 @@ def test_expected_widths_are_those_of_a_joint_fit_with_the_advised_test(of_publi
         + "".join(f'{name} = "shared"\n' for name in names),
         encoding="utf-8",
     )
-    joint = ff.joint(tmp_path / "both.toml", jobs=1)
+    joint = ff.joint(tmp_path / "both.toml")
     for name in names:
         low, high = joint.parameters[name].ci95
         width = found.advice.expected[name].ci95_width

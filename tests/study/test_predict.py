@@ -486,7 +486,7 @@ def joint(tmp_path_factory):
         'tests = ["t*.csv"]\nmodel = "microscale"\ndrive = "displacement"\nstarts = 1\n'
         "[parameters]\n" + "\n".join(f'{name} = "{kind}"' for name, kind in kinds.items())
     )
-    return ff.joint(here / "study.toml", jobs=1)
+    return ff.joint(here / "study.toml")
 
 
 def test_a_joint_fit_predicts_a_rate_between_its_own(tmp_path, joint):

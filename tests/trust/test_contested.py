@@ -168,7 +168,7 @@ def test_tests_of_a_joint_fit_have_the_same_default(
     study.write_text(
         'tests = ["*.csv"]\nmodel = "microscale"\nstarts = 2\n[parameters]\ns1_k0 = "shared"\n'
     )
-    found = ff.joint(study, jobs=1)
+    found = ff.joint(study)
     content = found.to_json_dict()
     drives = {name: one["drive"] for name, one in content["tests"].items()}
     assert drives == {"right": "impact", "wrong": "displacement"}

@@ -199,7 +199,7 @@ class Card:
     def save(self, path: str | Path) -> Path:
         """Write the card, PATH.json, PATH.png and PATH.pdf; return the path.
 
-        Raises InputError and writes nothing if one of the files cannot be written.
+        Raises InputError, before anything is written, if permissions forbid one of the files.
         """
         path = Path(path)
         files = [path, *(path.with_name(f"{path.name}.{form}") for form in ("json", "png", "pdf"))]
@@ -208,13 +208,8 @@ class Card:
         figure = draw(self)
         text = json.dumps(self.to_json_dict(), indent=2, allow_nan=False) + "\n"
         contents = (self.text.encode(), text.encode(), image(figure, "png"), image(figure, "pdf"))
-        for done, (one, content) in enumerate(zip(files, contents, strict=True)):
-            try:
-                write_file(one, content)
-            except InputError:
-                for written in files[:done]:
-                    written.unlink()
-                raise
+        for one, content in zip(files, contents, strict=True):
+            write_file(one, content)
         return path
 
 

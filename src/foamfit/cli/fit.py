@@ -174,7 +174,7 @@ def fit(
     made = ready.options
     if specimen not in (None, toml):
         made["specimen"] = specimen.stem
-    folder = output.folder(Path("fits", toml.stem, folder_name(made)), (test, specimen or toml))
+    folder = output.folder(Path("fits", toml.stem, folder_name(made)))
 
     def check(place: Path) -> None:
         if not force:
@@ -182,8 +182,7 @@ def fit(
 
     check(folder)
     options.compile_solver(output.silent, model)
-    with options.drawing(not output.no_report) as mapped:
-        with progress_line(output.silent, "fit", says=not output.quiet) as news:
-            found = replace(ready.fit(news), options=made)
-        page = folder / ("report.html" if ready.several is None else "cycles.png")
-        return output.finish(found, page, check=check, verbose=verbose, mapped=mapped)
+    with progress_line(output.silent, "fit", says=not output.quiet) as news:
+        found = replace(ready.fit(news), options=made)
+    page = folder / ("report.html" if ready.several is None else "cycles.png")
+    return output.finish(found, page, check=check, verbose=verbose)

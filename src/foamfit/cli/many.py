@@ -69,10 +69,6 @@ def batch(
         raise InputError("--jobs and --scheduler exclude each other; leave one of them out")
     output.check()
     search, cycles = keywords_of(asked), asked["cycle"]
-    from foamfit.study import processes
-
-    if scheduler is None:
-        processes.prepare((*processes.FITS, *(() if output.no_report else processes.PAGES)))
     from foamfit.report.listing import summary_words, table_rows
     from foamfit.study import batch as study
 
@@ -134,12 +130,11 @@ def _cluster(address: str) -> Iterator[Executor]:
 
 @main.command()
 @click.argument("study", metavar="STUDY.toml", type=options.FILE)
-@options.option("--jobs", "Processes. Default: one for each core.", options.COUNT)
 @options.declared(
     "seed", default=None, help="The same tests and seed give the same numbers. Default: 0."
 )
 @options.output("fits/<STUDY>", "joint.json")
-def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> int:
+def joint(study: Path, seed: int | None, output: Output) -> int:
     """Fit the tests of STUDY.toml together.
 
     Parameters are shared, own (one per test), scattering or rate-dependent.
@@ -165,17 +160,13 @@ def joint(study: Path, jobs: int | None, seed: int | None, output: Output) -> in
     Also: seed, cycle, starts, and [specimens] with a TOML for single tests: new-heel-1 = "a.toml".
     """
     output.check(without_report=False)
-    folder = output.folder(Path("fits", study.stem), [study])
+    folder = output.folder(Path("fits", study.stem))
     from foamfit.study.study_file import read_study
 
     read = read_study(study)
-    output.folder(folder, [path for _, path, _ in read.tests])
     from foamfit.study.joint import joint as fit_jointly
-    from foamfit.study.joint_result import FEW_FOLDERS
-    from foamfit.study.processes import workers
 
     options.compile_solver(output.silent, read.model)
-    with workers(jobs, len(read.tests), FEW_FOLDERS) as each:
-        with progress_line(output.silent, "joint fit") as line:
-            found = fit_jointly(read, jobs=jobs, seed=seed, progress=line.progress)
-        return output.finish(found, folder / "joint.html", mapped=each)
+    with progress_line(output.silent, "joint fit") as line:
+        found = fit_jointly(read, seed=seed, progress=line.progress)
+    return output.finish(found, folder / "joint.html")

@@ -6,8 +6,7 @@ import functools
 import json
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,9 +21,6 @@ from foamfit.options import OPTIONS
 from foamfit.terminal import say, without_ctrl_c
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future
-
-    from foamfit.report.result_figures import Mapped
     from foamfit.report.shown import Result
 
 Command = Callable[..., Any]
@@ -156,17 +152,12 @@ class Output:
             given = "json" if self.as_json else "no-report"
             raise InputError(f"--open and --{given} exclude each other; leave one of them out")
 
-    def folder(self, default: Path, inputs: Iterable[Path]) -> Path:
-        """Return the result folder; InputError if it cannot be written or holds an input."""
-        from foamfit.report.folder import try_target
+    def folder(self, default: Path) -> Path:
+        """Return the result folder; InputError if it cannot be written."""
+        from foamfit.report.folder import check_target
 
         folder = default if self.out is None else self.out
-        try_target(folder)
-        for path in inputs:
-            if folder.is_dir() and folder.resolve() in path.resolve().parents:
-                raise InputError(
-                    f"{folder} contains {path.name} and would be replaced; choose another --out"
-                )
+        check_target(folder)
         return folder
 
     def finish(
@@ -176,7 +167,6 @@ class Output:
         *,
         check: Callable[[Path], object] = lambda _: None,
         verbose: bool = False,
-        mapped: Mapped = map,
     ) -> int:
         """Save a result in the folder of `page`, print it and its place; return the exit code.
 
@@ -186,7 +176,7 @@ class Output:
 
         def save(place: Path, **how: Any) -> None:
             check(place)  # another fit may have written there in the meantime
-            found.save(place, figure_width=self.figure_width, mapped=mapped, **how)
+            found.save(place, figure_width=self.figure_width, **how)
 
         try:
             with progress_line(self.silent, "result") as line, without_ctrl_c():
@@ -248,19 +238,13 @@ def output(folder: str, printed: str) -> Callable[[Command], Command]:
     return add
 
 
-def check_files(table: Path | None, plot: Path | None, inputs: Iterable[Path]) -> None:
-    """Raise InputError if an output cannot be written or is also an input of the command."""
-    given = [path for path in (table, plot) if path is not None]
-    for path in given:
-        check_file(path)
-        if path.resolve() in [source.resolve() for source in inputs]:
-            raise InputError(f"{path} is read by this command and would be lost; name another file")
-    if len({path.resolve() for path in given}) < len(given):
-        raise InputError(f"{given[0]} is named twice; the table and the figure must be two files")
+def check_plot(plot: Path | None) -> None:
+    """Raise InputError if a figure cannot be written."""
     if plot is not None:
         from foamfit.report.figures import figure_format
 
         figure_format(plot)
+        check_file(plot)
 
 
 def compile_solver(quiet: bool, model: str = "bistable") -> None:
@@ -275,33 +259,3 @@ def compile_solver(quiet: bool, model: str = "bistable") -> None:
             say(f"foamfit: {cache.compiling('the solver')}", err=True)
 
     precompile.compile_solver(model, tell)
-
-
-@contextmanager
-def drawing(wanted: bool) -> Iterator[Mapped]:
-    """Yield a `map` that draws figures in two processes, at once, or here with a single core."""
-    from foamfit.study import processes
-
-    pool = None
-    if wanted and processes.cores() > 1:
-        with suppress(OSError):  # the system allows no more processes
-            pool = processes.Processes(2, processes.DRAWING)
-    if pool is None:
-        yield map
-        return
-
-    def start(draw: Callable[[str], Any], names: Iterable[str]) -> Iterable[Any]:
-        begun = [(name, pool.submit(draw, name)) for name in names]
-        return (_drawn(one, draw, name) for name, one in begun)
-
-    try:
-        yield start
-    finally:
-        pool.stop()
-
-
-def _drawn(begun: Future[Any], draw: Callable[[str], Any], name: str) -> Any:
-    try:
-        return begun.result()
-    except Exception:  # if the figure is at fault, drawing it here raises the error
-        return draw(name)

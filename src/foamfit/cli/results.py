@@ -44,8 +44,7 @@ def compare(
     from foamfit.report.comparison import compare as side_by_side
     from foamfit.report.comparison import comparison_text, plot_comparison
 
-    read = [path / "fit.json" if path.is_dir() else path for path in results]
-    options.check_files(None, plot, read)
+    options.check_plot(plot)
     comparison = side_by_side(results, name)
     say(comparison_text(comparison))
     if plot is not None:
@@ -138,10 +137,9 @@ def predict(
     from foamfit.report.folder import check_target
     from foamfit.study.identified import read_source
 
-    toml = toml_beside(test)
-    default = Path("predictions", toml.stem)
+    default = Path("predictions", toml_beside(test).stem)
     check_target(output.out or default, of="prediction.json")
-    folder = output.folder(default, (test, specimen or toml, result))
+    folder = output.folder(default)
     read_source(result)  # report a wrong path before anything is compiled
     measurement = read_test(test, specimen, cycle, cycles=cycles)
     from foamfit.study import predict as study
@@ -183,8 +181,7 @@ def plan(
     name = Path(results[0]).resolve()
     own = name.name if (name / "joint.json").is_file() else name.parent.name
     default = own if name.is_dir() else results[0].replace("/", "-")
-    given = [path for path in map(Path, results) if path.exists()]
-    folder = output.folder(Path("plans", default), [*given, *([rig] if rig else [])])
+    folder = output.folder(Path("plans", default))
     from foamfit.study import plan as study
 
     options.compile_solver(output.silent)

@@ -65,20 +65,13 @@ def init(test: Path, force: bool, rig: bool) -> None:
 
 def _write(target: Path, text: str, force: bool, kept: str) -> None:
     """Write a new file, or with `force` replace it; `kept` tells about an existing one."""
-    from foamfit.files import reason, write_file
+    from foamfit.files import write_file
 
-    try:
-        if force:
-            write_file(target, text.encode())
-        else:
-            with target.open("x", encoding="utf-8") as file:
-                file.write(text)
-    except FileExistsError:
+    if target.exists() and not force:
         raise InputError(
             f"{target} exists already and is not changed; {kept}, and --force overwrites it"
-        ) from None
-    except OSError as error:
-        raise InputError(f"{target} cannot be written: {reason(error)}") from None
+        )
+    write_file(target, text.encode())
 
 
 @main.command()
@@ -119,12 +112,14 @@ def simulate(
     microscale spring has k0, kc, eps_star, sigma_plus, spread_plus, sigma_minus and spread_minus.
     Both may have relaxation terms: relaxation = [{ g = 0.5, tau = "0.2 s" }].
     """
-    from foamfit.scene_file import check_target, files_of_scene, read_scene, write_response
+    from foamfit.files import check_file
+    from foamfit.scene_file import check_target, read_scene, write_response
     from foamfit.solve.simulation import simulate as run
 
     target = Path(scene.with_suffix(".csv").name) if out is None else out
-    options.check_files(target, plot, files_of_scene(scene))
-    check_target(target)
+    options.check_plot(plot)
+    check_file(target)
+    check_target(target)  # the scene and its drive are kept, as every file of others
     chain, drive, time = read_scene(scene)
     options.compile_solver(quiet=False)
     response = run(chain, drive, time, rtol)

@@ -99,9 +99,8 @@ class Window:
         self.template = self._template()
         self._allow()
         document = pn.state.curdoc
-        for part in first_use.parts:  # enable the buttons when the solver is compiled
-            if not part.done():
-                part.add_done_callback(lambda _: document.add_next_tick_callback(self._allow))
+        if not first_use.done.done():  # enable the buttons when the solver is compiled
+            first_use.done.add_done_callback(lambda _: document.add_next_tick_callback(self._allow))
         self._poll = pn.state.add_periodic_callback(self._follow, POLL, start=False)
         pn.state.on_session_destroyed(lambda _: gone())
         pn.state.onload(send_at_once)
@@ -160,8 +159,7 @@ class Window:
 
     def _allow(self) -> None:
         """Enable the Fit button: there is a test, the solver is compiled, and no fit is running."""
-        model, relaxation = self.inputs.model.value, self.inputs.relaxation.value
-        compiled = self.first_use.needed(model, relaxation).done()
+        compiled = self.first_use.done.done()
         self.compiling.object = "" if compiled else piece("busy", COMPILING)
         ready = self.desk.measurement is not None and compiled
         self.run.disabled = not ready or self.desk.running
@@ -324,7 +322,7 @@ class Window:
         """
 
         def make() -> Turning:
-            self.first_use.needed(model, options["relaxation"]).result()
+            self.first_use.done.result()
             test = self.desk.measured(of.cycle, of.last_cycle)
             made = Turning(test, model, values, **options)
             made.turn({})  # load the compiled code

@@ -32,8 +32,6 @@ from foamfit.errors import InputError
 from foamfit.page.worker import Job, Worker, parsed
 from foamfit.report import figures
 from foamfit.report.panels import Line, Panel, draw
-from foamfit.springs import laws
-from foamfit.system import end_all
 from foamfit.text import listed
 
 LARGEST = 64 * 1024 * 1024  # bytes of the largest file that can be dropped
@@ -72,7 +70,7 @@ class Desk:
     def close(self) -> None:
         """End the fit and remove the folder."""
         if self.worker is not None:
-            end_all(self.worker.process)
+            self.worker.end()
         shutil.rmtree(self.folder, ignore_errors=True)
 
     # ------------------------------------------------------------------------------- files
@@ -193,7 +191,7 @@ class Desk:
         folder = self.folder / f"fit-{self._fits}"
         toml = folder.with_suffix(".toml")  # the page may change it later
         toml.write_bytes(self.toml)
-        job = Job(str(self.csv), str(toml), str(folder), arguments, laws.texts())
+        job = Job(self.csv, toml, folder, arguments)
         self.worker = Worker(job)
         return self.worker
 
@@ -207,7 +205,7 @@ class Desk:
         """The folder of the last fit, if it has one."""
         if self.worker is None or self.worker.ended != "":
             return None
-        return Path(self.worker.job.folder)
+        return self.worker.job.folder
 
     @property
     def fits(self) -> dict[int, Path]:

@@ -10,6 +10,7 @@ import asyncio
 import logging
 import secrets
 import shutil
+import signal
 import socket
 import tempfile
 import webbrowser
@@ -28,8 +29,7 @@ from foamfit.errors import InputError
 from foamfit.page.app import Window
 from foamfit.page.desk import Desk
 from foamfit.page.worker import FirstUse
-from foamfit.system import at_end
-from foamfit.terminal import say
+from foamfit.terminal import ENDING, say
 
 HOST = "127.0.0.1"
 UNUSED = 20_000  # ms after which the files of a closed window are removed
@@ -129,7 +129,8 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
             loop = asyncio.get_running_loop()
             loop.set_exception_handler(_pass_over_closed_windows)
             logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)
-            at_end(loop, ending.set)
+            for number in ENDING:  # on Windows a loop has no handlers of signals
+                signal.signal(number, lambda *_: loop.call_soon_threadsafe(ending.set))
             say(page.address)
             say("foamfit: the page is open at this address until Ctrl-C", err=True)
             if browser:

@@ -1,44 +1,38 @@
 """Processes of the page: a fit, and the compilation of the solver.
 
-The process of a fit reads a job as one line of JSON and reports in lines of JSON. The line "stop"
-ends its search and keeps the best point, as Ctrl-C does in a terminal.
+The process of a fit reports through a pipe. A message to it ends its search and keeps the best
+point, as Ctrl-C does in a terminal.
 """
 
 from __future__ import annotations
 
 import _thread
-import contextlib
-import json
 import os
 import signal
-import subprocess
-import sys
-import tempfile
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foamfit.cli.progress import APART, Watcher
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.solve import cache
-from foamfit.springs.model import Model
-from foamfit.system import apart, end_all
+from foamfit.solve.precompile import LOOPS, compile_solver
+from foamfit.springs import laws
+from foamfit.terminal import ending_cleanly, without_ctrl_c
 
 if TYPE_CHECKING:
     from foamfit.arrays import Array
     from foamfit.fitting.problem import Problem
 
-PACKAGE = Path(__file__).parent.parent
+PROCESSES = get_context("spawn")
 COMPILING = "compiling the solver, once after installation"
-# Compiled in this order, for springs without and with memory: model, and the function that is
-# cached last.
-COMPILED = (("bistable", "integrate"), ("microscale", "follow"))
-COMPILE = """from foamfit.solve.precompile import compile_solver
-compile_solver({!r}, lambda: None)"""
 STOP = "stop"
 STOPPED_EARLY = "The fit was stopped before it had a result; start it again."
 
@@ -47,11 +41,11 @@ STOPPED_EARLY = "The fit was stopped before it had a result; start it again."
 class Job:
     """A fit to run: files, result folder and arguments of `foamfit fit`."""
 
-    csv: str
-    toml: str
-    folder: str
+    csv: Path
+    toml: Path
+    folder: Path
     arguments: list[str] = field(default_factory=list)
-    laws: dict[str, str] = field(default_factory=dict)  # the texts of law files, by path
+    laws: dict[str, str] = field(default_factory=laws.texts)  # the texts of law files, by path
 
 
 @dataclass(frozen=True)
@@ -69,12 +63,6 @@ class News:
     misfit: dict[str, float | None] = field(default_factory=dict)
 
 
-def with_package() -> dict[str, str]:
-    """Return an environment in which a process imports this copy of the package."""
-    paths = f"{PACKAGE.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
-    return os.environ | {"PYTHONPATH": paths.rstrip(os.pathsep)}
-
-
 class Worker:
     """A fit in another process: its last report, and how it ended."""
 
@@ -83,112 +71,89 @@ class Worker:
         self.stopping = False
         self.told = ""  # text that the command prints for several cycles
         self.ended: str | None = None  # after the end: why there is no result, or ""
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed when the process ends)
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "foamfit.page.worker"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            encoding="utf-8",
-            env=with_package(),
-            **apart(),
-        )
-        self._tell(json.dumps(vars(job)))
+        self._pipe, there = PROCESSES.Pipe()
+        self.process = PROCESSES.Process(target=run, args=(job, there), daemon=True)
+        self.process.start()
+        there.close()  # so that the pipe ends with the process
         threading.Thread(target=self._listen, daemon=True).start()
 
     def stop(self) -> None:
         """Stop the search; the result of the best point is still written."""
-        if not self.stopping and self.process.poll() is None:
+        if not self.stopping:
             self.stopping = True
-            self._tell(STOP)
+            with suppress(OSError):  # the process has ended
+                self._pipe.send(STOP)
 
-    def _tell(self, line: str) -> None:
-        """Write a line to the process, unless it has ended."""
-        assert self.process.stdin is not None
-        with contextlib.suppress(BrokenPipeError, ValueError):
-            self.process.stdin.write(line + "\n")
-            self.process.stdin.flush()
+    def end(self) -> None:
+        """End the process at once."""
+        self.process.kill()
+        self.process.join()
 
     def _listen(self) -> None:
         """Read the reports of the process until it ends."""
-        assert self.process.stdout is not None
         done: str | None = None
-        for line in self.process.stdout:
-            try:
-                report = json.loads(line)
-            except ValueError:  # output of a library, or an incomplete line
-                continue
-            if "ended" in report:
-                done, self.told = report["ended"], report.get("told", "")
-            else:
-                self.news = News(**report)
-        code = self.process.wait()
-        self.process.stdout.close()
-        with contextlib.suppress(BrokenPipeError):
-            self.process.stdin.close()  # type: ignore[union-attr]
-        done = self._why(code) if done is None else done
-        self._errors.close()
+        with suppress(EOFError, OSError):
+            while done is None:
+                report = self._pipe.recv()
+                if isinstance(report, News):
+                    self.news = report
+                else:
+                    done, self.told = report
+        self.process.join()
+        if done is None:
+            code = self.process.exitcode or 0
+            how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
+            done = f"The process of the fit has died {how}; start the fit again."
         self.ended = done
-
-    def _why(self, code: int) -> str:
-        """Describe how a process ended that did not report it."""
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        last = lines[-1].strip() if lines else ""
-        if self.stopping and (code == -signal.SIGINT or last == "KeyboardInterrupt"):
-            return STOPPED_EARLY
-        last = f" ({last})" if last else ""
-        how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-        return f"The process of the fit has died {how}{last}; start the fit again."
 
 
 class FirstUse:
-    """Compiles the solver in other processes, once after installation.
+    """Compiles the solver in another process, once after installation.
 
-    The page stays responsive meanwhile.
+    The page stays responsive meanwhile; `done` is the end of compiling.
     """
 
     def __init__(self) -> None:
-        self._process: subprocess.Popen[bytes] | None = None
-        self._closed = False
+        self.process = PROCESSES.Process(target=_compile, daemon=True)
         pool = ThreadPoolExecutor(1, thread_name_prefix="foamfit-compiling")
-        self.parts = [pool.submit(self._compile, *part) for part in COMPILED]
+        self.done: Future[None] = pool.submit(self._compile)
 
-    def needed(self, model: str, relaxation: int) -> Future[None]:
-        """Return the compilation that must finish before a model is simulated."""
-        memory = (
-            model == "auto" or relaxation or any(one.remembers for one in Model.parse(model).laws)
-        )
-        return self.parts[-1 if memory else 0]
-
-    def _compile(self, model: str, loop: str) -> None:
-        if self._closed or cache.compiled(loop):
-            return
-        command = [sys.executable, "-c", COMPILE.format(model)]
-        self._process = subprocess.Popen(command, env=with_package(), **apart())
-        self._process.wait()
+    def _compile(self) -> None:
+        if not all(map(cache.compiled, LOOPS)):
+            self.process.start()
+            self.process.join()
 
     def close(self) -> None:
         """Stop compiling."""
-        self._closed = True
-        if self._process is not None:
-            end_all(self._process)
+        if self.process.pid is not None:
+            self.process.kill()
 
 
-# --------------------------------------------------------------------- in the process of the fit
+# ------------------------------------------------------------------------ in the other processes
+
+
+def _leave_terminal() -> None:
+    """Keep Ctrl-C in the terminal from this process: the server ends it."""
+    if hasattr(os, "setpgrp"):  # not on Windows
+        os.setpgrp()
+
+
+def _compile() -> None:
+    _leave_terminal()
+    compile_solver("auto")
 
 
 class _Teller(Watcher):
     """Reports a fit to the page a few times a second."""
 
-    def __init__(self) -> None:
+    def __init__(self, pipe: Connection) -> None:
         super().__init__(says=False)
-        self.told: dict[str, Any] = {}
+        self.pipe, self.news = pipe, News()
         self._said = 0.0
 
     def progress(self, fraction: float, what: str, *, now: bool = False) -> None:
         """Report the completed fraction, at most once per `APART` seconds unless `now`."""
-        self.told |= {"fraction": fraction, "what": what}
+        self.news = replace(self.news, fraction=fraction, what=what)
         if now and self._best is not None:
             self._next = 0.0
         self.look()
@@ -198,24 +163,21 @@ class _Teller(Watcher):
     def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
         """Report the parameters and misfits of the best point so far."""
         named = zip(problem.names, (values + problem.origins).tolist(), strict=True)
-        self.told |= {
-            "model": problem.model.name,
-            "relaxation": problem.model.relaxation,
-            "drive": problem.objective.drive,
-            "cycle": problem.measurement.cycle,
-            "last_cycle": problem.measurement.last_cycle,
-            "values": dict(named),
-            "misfit": misfit,
-        }
+        self.news = replace(
+            self.news,
+            model=problem.model.name,
+            relaxation=problem.model.relaxation,
+            drive=problem.objective.drive,
+            cycle=problem.measurement.cycle,
+            last_cycle=problem.measurement.last_cycle,
+            values=dict(named),
+            misfit=misfit,
+        )
         self._say()
 
     def _say(self) -> None:
         self._said = time.monotonic()
-        _say(self.told)
-
-
-def _say(told: dict[str, Any]) -> None:
-    print(json.dumps(told), flush=True)
+        self.pipe.send(self.news)
 
 
 def parsed(arguments: list[str]) -> dict[str, Any]:
@@ -237,49 +199,39 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
     return {name: value for name, value in context.params.items() if name not in others}
 
 
-def _run(job: Job) -> tuple[str, str]:
+def _fitted(job: Job, teller: _Teller) -> tuple[str, str]:
     """Fit and write the result; return why the fit failed or "", and the text on cycles."""
-    try:
-        from foamfit.cli.fit import read_as_asked
-        from foamfit.solve.precompile import compile_solver
-        from foamfit.terminal import without_ctrl_c
+    from foamfit.cli.fit import read_as_asked
 
-        teller, asked = _Teller(), parsed(job.arguments)
+    try:
+        threading.Thread(target=_wait_for_stop, args=(teller.pipe,), daemon=True).start()
+        laws.load_texts(job.laws)
+        asked = parsed(job.arguments)
         width = asked.pop("figure_width")
         tell = partial(teller.progress, 0.0, COMPILING, now=True)
-        ready = read_as_asked(Path(job.csv), Path(job.toml), asked)
+        ready = read_as_asked(job.csv, job.toml, asked)
         compile_solver(asked["model"], tell)
         with as_signalled():
             found = ready.fit(teller)
         with without_ctrl_c():
             teller.progress(1.0, "writing the report", now=True)
             found.save(job.folder, figure_width=width)
-            told = "" if ready.several is None else found.text()
+            return "", "" if ready.several is None else found.text()
     except (InputError, SimulationError) as error:
         return str(error), ""
     except KeyboardInterrupt:
         return STOPPED_EARLY, ""
-    return "", told
 
 
-def _wait_for_stop() -> None:
-    """Interrupt the main thread when stdin says so."""
-    if sys.stdin.readline().strip() == STOP:
-        _thread.interrupt_main()
+def _wait_for_stop(pipe: Connection) -> None:
+    """Interrupt the main thread when a message says so."""
+    with suppress(EOFError, OSError):
+        if pipe.recv() == STOP:
+            _thread.interrupt_main()
 
 
-def main() -> None:
-    """Run the job that stdin describes."""
-    from foamfit.springs import laws
-    from foamfit.terminal import ending_cleanly
-
-    job = Job(**json.loads(sys.stdin.readline()))
-    threading.Thread(target=_wait_for_stop, daemon=True).start()
-    laws.load_texts(job.laws)
+def run(job: Job, pipe: Connection) -> None:
+    """Run a job; reports, and in the end its outcome, go to a pipe."""
+    _leave_terminal()
     with ending_cleanly():
-        ended, told = _run(job)
-    _say({"ended": ended, "told": told})
-
-
-if __name__ == "__main__":
-    main()
+        pipe.send(_fitted(job, _Teller(pipe)))

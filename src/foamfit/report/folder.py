@@ -10,7 +10,8 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -18,22 +19,17 @@ from foamfit.arrays import Array
 from foamfit.codec import plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, reason, replacing
-from foamfit.report.figures import TWO
-from foamfit.report.result_figures import Mapped, draw_all
+from foamfit.report.figures import TWO, image
+from foamfit.report.result_figures import figures_of
 from foamfit.report.summary import render_report
 from foamfit.report.tables import numbers_of, parameters_tex, with_head
 from foamfit.results import SCHEMA, Fit
-from foamfit.springs.parameters import unit_of
 
-if TYPE_CHECKING:
-    import xarray
-
-
-SAMPLES = "samples.nc"
+SAMPLES = "samples.npz"
 # Files of each kind of result, by the file that identifies it. They include files that only older
 # versions wrote, so that older folders can be replaced.
 _OLDER = {"fit.csv", "residuals.csv", "sensitivities.csv", "residuals.pdf", "information.pdf"}
-_OLDER |= {"snapping.pdf", "profiles.pdf", "ladder.csv"}
+_OLDER |= {"snapping.pdf", "profiles.pdf", "ladder.csv", "samples.nc"}
 _TABLES = {"fit.json", "parameters.csv", "curves.csv", "profiles.csv", "budget.csv"}
 _DRAWN = {"fit.png", "fit.pdf", "report.html"}
 _KINDS = ("json", "csv", "html", "tex", "png", "pdf")
@@ -46,10 +42,6 @@ FILES = {
     "prediction.json": {f"prediction.{kind}" for kind in _KINDS},
     "plan.json": {*(f"plan.{kind}" for kind in _KINDS), "next.toml", "joint.toml"},
 }
-
-
-class _TriedError(Exception):
-    """Raised by `try_target` to undo its trial."""
 
 
 def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool = False) -> Path:
@@ -69,16 +61,6 @@ def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool
             f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
         ) from error
     return folder
-
-
-def try_target(folder: str | Path) -> None:
-    """Raise InputError if no result can be written to `folder`; leave nothing behind."""
-
-    def undo(_: Path) -> NoReturn:
-        raise _TriedError
-
-    with suppress(_TriedError):
-        save_whole(folder, undo, swept=True)
 
 
 def save_somewhere(
@@ -238,16 +220,12 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     return content
 
 
-def write_result(
-    result: Fit, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
-) -> None:
+def write_result(result: Fit, folder: Path, *, pages: bool = True, width: str = TWO) -> None:
     """Write all files of a result into an existing folder; report and figures only with `pages`.
 
     ``profiles.csv`` is written if there are profiles, ``budget.csv`` if the budget contains more
-    than the parameters. For `width` and `mapped` see
-    `foamfit.report.result_figures.draw_all`.
+    than the parameters.
     """
-    figures = draw_all(result, width, mapped) if pages else ()  # other processes start to draw now
     write_json(folder / "fit.json", result.to_json_dict())
     texts = ("unit", "state", "why", "ci95_method")
     parameters = (
@@ -261,14 +239,14 @@ def write_result(
         rows = (row for profile in result.intervals.profiles for row in profile.rows())
         write_table(folder / "profiles.csv", rows)
     if result.draws:
-        write_samples(folder / SAMPLES, result.draws)
+        samples: Any = result.draws  # NumPy types the names of arrays as its options
+        np.savez(folder / SAMPLES, **samples)
     if pages and result.budget is not None and result.budget.telling:
         write_table(folder / "budget.csv", result.budget.rows())
-    for name, images in (drawn := dict(figures)).items():
-        for kind in ("png", "pdf"):
-            if content := getattr(images, kind, b""):
-                (folder / f"{name}.{kind}").write_bytes(content)
     if pages:
+        drawn = figures_of(result, width)
+        (folder / "fit.png").write_bytes(image(drawn["fit"], "png"))
+        (folder / "fit.pdf").write_bytes(image(drawn["fit"], "pdf"))
         write_text(folder / "report.html", render_report(result, drawn))
 
 
@@ -301,51 +279,12 @@ def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
     path.write_bytes(csv_bytes([columns, *samples]))
 
 
-_DIMS = ("chain", "draw")
-
-
-def write_samples(path: Path, draws: Mapping[str, Array]) -> None:
-    """Write samples (chain, draw) of parameters in SI; `xarray.open_dataset` reads the file."""
-    from scipy.io import netcdf_file
-
-    with netcdf_file(path, "w", version=2) as file:
-        for dim, size in zip(_DIMS, next(iter(draws.values())).shape, strict=True):
-            file.createDimension(dim, size)
-            file.createVariable(dim, "i4", (dim,))[:] = np.arange(size)
-        for name, values in draws.items():
-            variable: Any = file.createVariable(name, "f8", _DIMS)
-            variable[:] = values
-            variable.units = unit_of(name) or "1"
-
-
 def read_samples(path: Path) -> dict[str, Array]:
-    """Read a file of `write_samples`; return an empty dict if the file does not exist."""
-    from scipy.io import netcdf_file
-
+    """Return the samples (chain, draw) of each parameter in SI; empty if there is no file."""
     if not path.is_file():
         return {}
     try:
-        with netcdf_file(path, "r", mmap=False) as file:
-            found = file.variables.items()
-            return {name: np.array(v[:], dtype=float) for name, v in found if name not in _DIMS}
-    except (OSError, ValueError, TypeError, IndexError) as error:
+        with np.load(path) as file:
+            return dict(file)
+    except (OSError, ValueError, BadZipFile) as error:
         raise InputError(f"{path} is damaged: {error}") from None
-
-
-def dataset(draws: Mapping[str, Array], **about: str) -> xarray.Dataset:
-    """Return samples in the form that ArviZ reads: dimensions chain and draw, attributes `units`.
-
-    Raises
-    ------
-    InputError
-        If xarray is not installed.
-    """
-    try:
-        import xarray
-    except ImportError:
-        raise InputError(
-            'samples need xarray, which is not installed; pip install "foamfit[mcmc]"'
-        ) from None
-    columns = {n: (_DIMS, values, {"units": unit_of(n) or "1"}) for n, values in draws.items()}
-    sizes = zip(_DIMS, next(iter(draws.values())).shape, strict=True)
-    return xarray.Dataset(columns, {dim: np.arange(size) for dim, size in sizes}, about)

@@ -1,4 +1,4 @@
-"""Figures of a result, each drawn once for all its files, in any process.
+"""Figures of a result, each drawn once for all its files.
 
 The figure of the fit is in `plots`; the other figures of the report, profiles of the cost and
 snapped micro-springs, are here.
@@ -6,9 +6,6 @@ snapped micro-springs, are here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +13,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, UNTITLED, VERMILION
+from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, VERMILION
 from foamfit.report.plots import plot_fit
 from foamfit.report.readable import readable_unit
 from foamfit.results import Fit
@@ -28,64 +25,28 @@ if TYPE_CHECKING:
     from foamfit.parts import ParameterEstimate
     from foamfit.results import Profile
 
-Mapped = Callable[..., Iterable[Any]]  # such as the built-in `map`
-# Widths of the figure of the fit in its page, which has its own title, and on a phone.
-_ON_PAGE = {"shown": f"{TWO}, {UNTITLED}", "narrow": f"one, {UNTITLED}"}
-_NAMES = ("fit", *_ON_PAGE, "snapping", "profiles")  # in the order of drawing
-
 INSTANTS = 7  # pictures of a foam
 SNAPPED, STANDING = "#7FB2D9", "#E6EEF4"  # shades of the snapped part and of the rest of a spring
 
 
-@dataclass(frozen=True)
-class Images:
-    """A figure as the bytes of image files: SVG in the page, or PNG and PDF beside it."""
-
-    width: float  # inches
-    svg: bytes = b""
-    png: bytes = b""
-    pdf: bytes = b""
-
-
-def draw_all(
-    result: Fit, width: str = TWO, mapped: Mapped = map
-) -> Iterator[tuple[str, Images | None]]:
-    """Draw all figures of a result with `mapped`; yield names and images, None if inapplicable.
-
-    With the `map` of an executor, drawing starts at once in its processes, and the returned
-    iterator waits for each figure. `width` is that of "fit" (`foamfit.report.plots.plot_fit`).
-    """
-    drawn: dict[str, Any] = {field.name: getattr(result, field.name) for field in fields(Fit)}
-    # No figure needs these, and unpickling them would import lmfit, the slowest import.
-    drawn |= dict.fromkeys(("params", "problem", "effort"))
-    images = mapped(partial(_draw, Fit(**drawn), width), _NAMES)  # not in a generator: start now
-    return zip(_NAMES, images, strict=True)
+def figures_of(result: Fit, width: str = TWO) -> dict[str, Figure]:
+    """Return the figures of a result by name; `width` is that of "fit"."""
+    drawn = {
+        "fit": plot_fit(result, width=width),
+        "snapping": plot_snapping(result),
+        "profiles": plot_profiles(result),
+    }
+    return {name: figure for name, figure in drawn.items() if figure is not None}
 
 
-def _draw(result: Fit, width: str, name: str) -> Images | None:
-    """Draw a figure, or return None if the result does not have it."""
-    figure: Figure | None = None
-    if name == "snapping":
-        figure = plot_snapping(result)
-    elif name != "profiles":
-        figure = plot_fit(result, width=_ON_PAGE.get(name, width))
-    elif result.intervals is not None and result.intervals.profiles:
-        figure = plot_profiles(result)
-    if figure is None:
-        return None
-    wide = float(figure.get_figwidth())
-    if name != "fit":
-        return Images(wide, figures.image(figure, "svg"))
-    return Images(wide, png=figures.image(figure, "png"), pdf=figures.image(figure, "pdf"))
-
-
-def plot_profiles(result: Fit) -> Figure:
+def plot_profiles(result: Fit) -> Figure | None:
     """Draw each profile of the cost with its 95 % threshold and interval, four panels per row.
 
-    The dashed parabola is that of the local covariance.
+    The dashed parabola is that of the local covariance. Return None without a profile.
     """
-    assert result.intervals is not None
-    profiles = result.intervals.profiles
+    profiles = () if result.intervals is None else result.intervals.profiles
+    if not profiles:
+        return None
     rows = -(-len(profiles) // 4)
     with figures.drawing(7.0, 0.55 + 1.55 * rows) as figure:
         axes = figures.grid_of(figure, rows, 4, len(profiles), sharey=True)

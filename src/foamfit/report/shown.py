@@ -10,38 +10,23 @@ from typing import Any, ClassVar
 from foamfit.report.figures import TWO, inches
 from foamfit.report.folder import check_target, save_whole
 from foamfit.report.readable import Readable
-from foamfit.report.render import page
-from foamfit.report.result_figures import Mapped
 from foamfit.text import wrapped
 
 
-def brief(title: str, line: str, rows: Sequence[Readable], html: bool, table: Any = None) -> str:
-    """Return a result in a few lines, or as HTML with a table of parameters or tests."""
-    if html:
-        return page("shown", title=title, line=line, rows=rows, by_test=table)
+def brief(title: str, line: str, rows: Sequence[Readable]) -> str:
+    """Return a result in a few lines: a line about it, and its parameters."""
     marks = {"weak": " (weak)", "not determined": " (not determined)"}
     values = (f"{p.label} {p.with_unit(p.with_error)}{marks.get(p.state, '')}" for p in rows)
     return "\n".join([*wrapped(f"{title}: {line}", 2), *wrapped(", ".join(values), 2)])
 
 
-def told(title: str, sentences: Sequence[str], html: bool) -> str:
-    """Return a result in sentences, as text or HTML."""
-    if html:
-        return page("told", title=title, sentences=sentences)
-    return "\n  ".join((title, *sentences))
-
-
 class Result:
-    """A result that Python shows in a few lines, a notebook as HTML, and a folder keeps."""
+    """A result that Python shows in a few lines and a folder keeps."""
 
     # The only kind of result, one of `folder.FILES`, that it may replace; None: any.
     _replaces: ClassVar[str | None] = None
 
-    def _shown(self, *, html: bool = False) -> str:
-        """Return the result as text or HTML."""
-        raise NotImplementedError
-
-    def write(self, folder: Path, *, pages: bool, width: str, mapped: Mapped) -> None:
+    def write(self, folder: Path, *, pages: bool, width: str) -> None:
         """Write all files into an existing folder; pages and figures only with `pages`."""
         raise NotImplementedError
 
@@ -62,28 +47,18 @@ class Result:
         """Return what the command prints as JSON."""
         return self.to_json_dict()
 
-    def __repr__(self) -> str:
-        """Return the result in a few lines."""
-        return self._shown()
-
-    def _repr_html_(self) -> str:
-        return self._shown(html=True)
-
     def save(
         self,
         folder: str | Path,
         *,
         report: bool = True,
         figure_width: str = TWO,
-        mapped: Mapped = map,
     ) -> Path:
         """Write the result folder and return its path; an older folder is replaced at the end.
 
         Without `report`, neither pages nor figures are written. `figure_width` is "one" or "two"
-        columns, or a length ("85 mm"); ", untitled" after it omits the titles. `mapped` draws the
-        figures; give the `map` of an executor to draw them in parallel.
+        columns, or a length ("85 mm"); ", untitled" after it omits the titles.
         """
         inches(figure_width)  # rejects an invalid width
         check_target(folder, of=self._replaces)
-        drawn: Any = {"pages": report, "width": figure_width, "mapped": mapped}
-        return save_whole(folder, partial(self.write, **drawn))
+        return save_whole(folder, partial(self.write, pages=report, width=figure_width))

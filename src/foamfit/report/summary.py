@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from foamfit.data.measurement import interior_channel
 from foamfit.fitting.branches import covered
 from foamfit.fitting.nuisance import POSITIVE
 from foamfit.parts import ParameterEstimate
+from foamfit.report.figures import image
 from foamfit.report.plots import origin_word
 from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page, sentences, table, words
-from foamfit.report.result_figures import Images, draw_all
+from foamfit.report.result_figures import figures_of
 from foamfit.report.tables import count_determined
 from foamfit.results import STATED, Fit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, counted, percent, wrapped
 from foamfit.trust.covariance import RULE
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CURVES = {
     "stress_time": "stress-time",
@@ -212,9 +216,9 @@ def tables(result: Fit) -> dict[str, list[list[str]]]:
     }
 
 
-def render_report(result: Fit, figures: Mapping[str, Images | None] | None = None) -> str:
-    """Return the report as a self-contained HTML page; `figures` are those of `draw_all`."""
-    drawn = dict(draw_all(result)) if figures is None else figures
+def render_report(result: Fit, figures: Mapping[str, Figure] | None = None) -> str:
+    """Return the report as a self-contained HTML page; `figures` are those of `figures_of`."""
+    drawn = figures_of(result) if figures is None else figures
     plain, springs, insight = result.to_json_dict(), result.springs, result.insight
     parts, shares = ((), None) if insight is None else (insight.parts, insight.shares())
     return page(
@@ -235,5 +239,5 @@ def render_report(result: Fit, figures: Mapping[str, Images | None] | None = Non
         parts=[] if shares is None else list(zip(parts, shares.T.tolist(), strict=True)),
         correlation=[] if result.correlation is None else result.correlation.matrix.tolist(),
         **tables(result),
-        figures=drawn,
+        figures={n: (one.get_figwidth(), image(one, "svg")) for n, one in drawn.items()},
     )

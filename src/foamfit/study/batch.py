@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,9 +12,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Unpack
 
-from foamfit.data.toml_file import motion_file, toml_beside
+from foamfit.data.toml_file import toml_beside
 from foamfit.errors import InputError, check_whole
-from foamfit.files import is_left, read_whole, reason, sweep
+from foamfit.files import is_left, reason, sweep
 from foamfit.fitting import nuisance
 from foamfit.fitting.problem import check_fixed_and_varied
 from foamfit.one_model import Options
@@ -27,7 +26,7 @@ from foamfit.report.folder import FILES, check_target, is_written
 from foamfit.report.listing import Row
 from foamfit.solve import precompile
 from foamfit.springs.model import Model, with_options
-from foamfit.study.batch_work import Outcome, Recipe, Task, fingerprint, put, stored, work
+from foamfit.study.batch_work import Recipe, Task, fingerprint, stored, work
 from foamfit.study.processes import FITS, PAGES, EndedError, Processes, cores
 from foamfit.study.study_file import find_tests
 from foamfit.terminal import without_ctrl_c
@@ -36,11 +35,8 @@ from foamfit.text import counted
 if TYPE_CHECKING:
     import pandas as pd
 
-_LOG = logging.getLogger(__name__)
-# Largest number of tests submitted to the executor at a time, and total size of their files.
-MOST_AHEAD, MOST_BYTES = 1000, 2**28
-PAUSE = 5.0  # least time between two summaries, s
-SHARE = 50.0  # least ratio of this time to the time that writing a summary takes
+MOST_AHEAD = 1000  # tests submitted to the executor at a time
+PAUSE = 60.0  # least time between two summaries, s: of many tests, one takes seconds
 Tests = str | Path | Iterable[str | Path]
 Cycles = int | Sequence[int] | Literal["all"] | None
 
@@ -53,15 +49,13 @@ class Batch:
     recipe: Recipe
     tests: list[tuple[str, Path]]  # name and file
     toml: Path | None  # for all tests; None: the TOML next to each
-    foreign: bool  # whether the fits may run on machines with other files
     fresh: bool
     progress: Callable[[Batch], None]
     rows: dict[str, tuple[Row, ...]] = field(default_factory=dict)  # by name of the test
-    waiting: dict[Future[Outcome], Task] = field(default_factory=dict)
+    waiting: dict[Future[tuple[Row, ...]], Task] = field(default_factory=dict)
     fitted: int = 0  # number of tests fitted in this call
     wrong: int = 0  # number of finished tests without an acceptable fit
     saved: float = field(default_factory=lambda: time.monotonic())  # time of the last summary
-    took: float = 0.0  # time that writing the summary took, s
 
     @property
     def summary(self) -> list[Row]:
@@ -90,12 +84,9 @@ class Batch:
         try:
             for name, path in self.tests:
                 self._begin(executor, name, path)
-                while (
-                    len(self.waiting) >= MOST_AHEAD
-                    or sum(task.size for task in self.waiting.values()) >= MOST_BYTES
-                ):
-                    self._collect(1.0)
                 self._collect(0.0)
+                while len(self.waiting) >= MOST_AHEAD:
+                    self._collect(1.0)
             while self.waiting:
                 self._collect(1.0)
         except BaseException as error:
@@ -116,19 +107,12 @@ class Batch:
         """Use the stored rows of a test, or submit its fit."""
         toml = toml_beside(path) if self.toml is None else self.toml
         folder = self.out / name
-        try:
-            data, settings, camera = read_whole(path), _bytes(toml), motion_file(toml)
-            motion = None if camera is None else _bytes(camera)
-        except OSError:  # the fit reads the test again, with a better error message
-            data, settings, motion = b"", None, None
-        mark = fingerprint(self.recipe.key, data, settings, motion)
+        mark = fingerprint(self.recipe, path, toml)
         rows = None if self.fresh else stored(folder, mark, self.recipe)
         if rows is not None:
             self._keep(name, tuple(replace(row, file=str(path)) for row in rows))
             return
-        content = (data, settings, motion) if self.foreign and data else None
-        out = None if self.foreign else folder.absolute()
-        task = Task(name, path, toml, self.recipe, mark, out, content)
+        task = Task(name, path, toml, self.recipe, mark, folder)
         try:
             self.waiting[executor.submit(work, task)] = task
         except RuntimeError as error:  # the executor was shut down
@@ -139,18 +123,14 @@ class Batch:
         done, _ = futures.wait(self.waiting, seconds, futures.FIRST_COMPLETED)
         for future in [future for future in self.waiting if future in done]:
             self._take(future)
-        began = time.monotonic()
-        if began - self.saved >= max(PAUSE, SHARE * self.took):
+        if time.monotonic() - self.saved >= PAUSE:
             self.save()
             self.saved = time.monotonic()
-            self.took = self.saved - began
 
-    def _take(self, future: Future[Outcome]) -> None:
+    def _take(self, future: Future[tuple[Row, ...]]) -> None:
         task = self.waiting.pop(future)
         try:
-            rows, files = future.result()
-            if files is not None:
-                put(files, self.out / task.name)
+            rows = future.result()
         except (futures.BrokenExecutor, futures.CancelledError, InputError):
             raise  # the result cannot be written, or no other test can be fitted
         except Exception as error:
@@ -197,9 +177,9 @@ def batch(
     model, options
         As for `foamfit.fit`.
     executor : concurrent.futures.Executor, optional
-        Executor that runs the fits, such as a Dask client's ``get_executor()``. Tests and results
-        are passed with the calls, so its machines need no common file system. By default the fits
-        run in single-threaded processes on this machine, one per core.
+        Executor that runs the fits, such as a Dask client's ``get_executor()``. Its machines must
+        see the same file system. By default the fits run in single-threaded processes on this
+        machine, one per core.
     jobs : int, optional
         Number of processes on this machine.
     fresh : bool
@@ -248,15 +228,18 @@ def batch(
         raise InputError(f"{toml}: no such file; give the TOML of the specimen for all tests")
     folder = Path("fits", "batch", named) if out is None else Path(out)
     found, notify = find_tests(tests), progress or (lambda _: None)
-    made = Batch(folder, recipe, found, toml, executor is not None, fresh, notify)
+    made = Batch(folder, recipe, found, toml, fresh, notify)
     _check_out(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         sweep(folder.resolve(), [*(name for name, _ in found), *FILES["batch.json"]])
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {reason(error)}") from None
-    with _executor(executor, jobs, made) as runner:
-        made.fit(runner)
+    try:
+        with _executor(executor, jobs, made) as runner:
+            made.fit(runner)
+    finally:  # a process that was killed may have left half a folder
+        sweep(folder.resolve(), [name for name, _ in found])
     return tables.read_table(folder / "summary.csv")
 
 
@@ -305,23 +288,15 @@ def _executor(given: Executor | None, jobs: int | None, made: Batch) -> Iterator
         return
     precompile.compile_solver(made.recipe.model)
     count = min(jobs or cores(), max(len(made.tests), 1))
-    try:
-        with Processes(count, (*FITS, *(PAGES if made.recipe.pages else ()))) as pool:
-            yield pool
-    finally:
-        sweep(made.out.resolve(), [name for name, _ in made.tests])
-
-
-def _bytes(path: Path) -> bytes | None:
-    return path.read_bytes() if path.is_file() else None
+    with Processes(count, (*FITS, *(PAGES if made.recipe.pages else ()))) as pool:
+        yield pool
 
 
 def _lost(error: Exception) -> str:
     """Return why a test has no result if the cause may lie outside the test."""
     if isinstance(error, EndedError) or type(error).__name__ == "KilledWorker":  # raised by Dask
         return (
-            "its process ended in every attempt to fit it (killed, or out of memory); call again "
-            "to retry"
+            "its process ended before it was fitted (killed, or out of memory); call again to retry"
         )
     why = " ".join(f"{type(error).__name__}: {error}".split())
     return f"its fit was lost ({why}); call again to retry"

@@ -26,11 +26,10 @@ from foamfit.report.folder import write_json, write_result, write_table, write_t
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import own_name
 from foamfit.report.render import words
-from foamfit.report.result_figures import Mapped
 from foamfit.report.shown import Result, brief
 from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
 from foamfit.report.summary import CURVES
-from foamfit.report.tables import by_test, by_test_tex, frame, stacked, varied, wide
+from foamfit.report.tables import by_test_tex, frame, stacked, varied, wide
 from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, percent
@@ -130,22 +129,21 @@ class CycleFits(Result):
 
         return pd.DataFrame(list(self.rows())).set_index("cycle")
 
-    def _shown(self, *, html: bool = False) -> str:
-        """Return the number of fitted cycles and their misfits; in HTML also their parameters."""
+    def __repr__(self) -> str:
+        """Return the number of fitted cycles and their misfits."""
         cycles = counted(len(self.recorded), "cycle")
         line = f"{self.model} · {len(self.results)} of {cycles} fitted"
         misfits = (one.misfit.get("stress_strain") for one in self.results.values())
         if known := [misfit for misfit in misfits if misfit is not None]:
             line += f" · misfit {percent(min(known))} to {percent(max(known))}"
-        table = by_test(list(map(str, sorted(self.results))), self.varied) if html else {}
-        return brief(self.test, line, [], html, table and {"first": "cycle", **table})
+        return brief(self.test, line, [])
 
-    def write(self, folder: Path, *, pages: bool, width: str, mapped: Mapped) -> None:
+    def write(self, folder: Path, *, pages: bool, width: str) -> None:
         """Write ``cycle-<n>/``, cycles.csv, cycles.json, table.tex and figures."""
         for number, result in self.results.items():
             inner = folder / f"cycle-{number}"
             inner.mkdir()
-            write_result(result, inner, pages=pages, width=width, mapped=mapped)
+            write_result(result, inner, pages=pages, width=width)
         write_table(folder / "cycles.csv", self.rows())
         write_json(folder / "cycles.json", self.to_json_dict())
         numbers = [str(number) for number in sorted(self.results)]

@@ -24,21 +24,18 @@ from foamfit.fitting.problem import Problem, fix_and_vary, make_params
 from foamfit.fitting.search import Tracker, descend
 from foamfit.fitting.together import Together
 from foamfit.one_model import Options, Progress, identify
-from foamfit.report.folder import try_target
+from foamfit.report.folder import check_target
 from foamfit.springs.model import Model
 from foamfit.study import joint_fit
-from foamfit.study.joint_fit import Map, fit_jointly
+from foamfit.study.joint_fit import fit_jointly
 from foamfit.study.joint_parameters import result_of
-from foamfit.study.joint_result import FEW_FOLDERS, JointResult
-from foamfit.study.processes import workers
+from foamfit.study.joint_result import JointResult
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
 from foamfit.trust.settle import follow_samples, keep_to_record, weigh_motion
 
 # Number of tests fitted by a full search; the others start at the results of these.
 SEARCHED = 3
-# Largest number of tests fitted in this process: most fits take less than 0.1 s.
-FEW = 100
 # A test is searched as well if its reduced χ² exceeds the largest of those by this factor.
 FAR = 2.0
 STEPS = 60  # of a descent from the result of another test
@@ -64,7 +61,6 @@ class _Test:
 def joint(
     path: str | Path | Study,
     *,
-    jobs: int | None = None,
     out: str | Path | None = None,
     seed: int | None = None,
     report: bool = True,
@@ -77,8 +73,6 @@ def joint(
     path : str, Path or Study
         STUDY.toml, or the result of `read_study`: tests, model, drive, and for each parameter its
         kind ("shared", "own", "scatter", "log rate", "power rate" or "auto") or a fixed value.
-    jobs : int, optional
-        Number of processes; by default one per core. It does not affect the numbers.
     out : str or Path, optional
         Folder for the result, written as by `JointResult.save` with or without `report`.
     seed : int, optional
@@ -98,35 +92,33 @@ def joint(
     study = path if isinstance(path, Study) else read_study(path)
     study = study if seed is None else replace(study, seed=seed)
     if out is not None:
-        try_target(out)
+        check_target(out)
     options = Options(
         drive=study.drive, seed=study.seed, starts=study.starts, relaxation=study.relaxation
     )
     tests, refused = _read(study, options, tell)
     _links(study, tests)  # rejects invalid kinds before anything is fitted
-    with workers(jobs, len(tests), FEW) as each:
-        tests, alone = _own_fits(study, options, tests, refused, each, tell)
-        links, starts = _links(study, tests), alone.starts(ONE_FOR_ALL)
-        rates = [test.rate for test in tests]
-        # The evidence is not computed for scatter, nor for rate laws if all rates are equal.
-        kinds = [kind for kind in KINDS if kind not in ("scatter", *RATES)]
-        kinds += RATES if None not in rates and _several(rates) else ()
-        tell(0.5, "together")
-        auto = [name for name, kind in study.kinds.items() if kind == AUTO and name in alone.own]
-        if auto:
-            links = joint_fit.choose_kinds(alone.problems, links, auto, starts, alone.n_eff, kinds)
-        fit = fit_jointly(alone.problems, links, starts, each=each)
-        tell(0.9, "evidence")
-        every = (*fit.found.shared, *fit.found.own)
-        compared = [name for name in every if links.kind(name) in RATES or name in auto]
-        tried, slopes = joint_fit.evidence(fit.found, compared, alone.n_eff, kinds, [alone.values])
-        files, rate0 = {test.name: test.file for test in tests}, _median_rate(rates)
-        about = {"evidence": tried, "refused": refused, "runtime_s": time.perf_counter() - began}
-        result = result_of(study, files, rates, rate0, fit, alone, slopes, **about)
+    tests, alone = _own_fits(study, options, tests, refused, tell)
+    links, starts = _links(study, tests), alone.starts(ONE_FOR_ALL)
+    rates = [test.rate for test in tests]
+    # The evidence is not computed for scatter, nor for rate laws if all rates are equal.
+    kinds = [kind for kind in KINDS if kind not in ("scatter", *RATES)]
+    kinds += RATES if None not in rates and _several(rates) else ()
+    tell(0.5, "together")
+    auto = [name for name, kind in study.kinds.items() if kind == AUTO and name in alone.own]
+    if auto:
+        links = joint_fit.choose_kinds(alone.problems, links, auto, starts, alone.n_eff, kinds)
+    fit = fit_jointly(alone.problems, links, starts)
+    tell(0.9, "evidence")
+    every = (*fit.found.shared, *fit.found.own)
+    compared = [name for name in every if links.kind(name) in RATES or name in auto]
+    tried, slopes = joint_fit.evidence(fit.found, compared, alone.n_eff, kinds, [alone.values])
+    files, rate0 = {test.name: test.file for test in tests}, _median_rate(rates)
+    about = {"evidence": tried, "refused": refused, "runtime_s": time.perf_counter() - began}
+    result = result_of(study, files, rates, rate0, fit, alone, slopes, **about)
     tell(1.0, "done")
     if out is not None:
-        with workers(jobs, len(result.tests), FEW_FOLDERS) as each:
-            result.save(out, report=report, mapped=each)
+        result.save(out, report=report)
     return result
 
 
@@ -236,7 +228,6 @@ def _own_fits(
     options: Options,
     tests: list[_Test],
     refused: dict[str, str],
-    each: Map,
     tell: Progress,
 ) -> tuple[list[_Test], Together]:
     """Return the tests that can be fitted, and the results of their separate fits.
@@ -250,12 +241,9 @@ def _own_fits(
     found = dict[int, _Own]()
 
     def do(chosen: Sequence[int], near: tuple[Array, ...], done: float) -> None:
-        work = [
-            (tests[t].problem.measurement, study.model, tests[t].params, options, near)
-            for t in chosen
-        ]
-        fits = each(_own_fit, *zip(*work, strict=True)) if work else ()
-        for i, (t, fitted) in enumerate(zip(chosen, fits, strict=True)):
+        for i, t in enumerate(chosen):
+            test = tests[t]
+            fitted = _own_fit(test.problem.measurement, study.model, test.params, options, near)
             if isinstance(fitted, str):
                 refused[str(tests[t].file)] = fitted
             else:

@@ -9,9 +9,8 @@ them (`trust.scatter`). This is repeated until the spread no longer changes (Lap
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -38,7 +37,6 @@ LEAST_SPREAD = 0.3
 SAYS_NOTHING = 5.0
 GROUPS = 10  # largest number of groups of tests that are left out in turn
 REFIT = 15  # iterations of a fit without one group
-Map = Callable[..., Iterable[Any]]
 Vectors = Sequence[Array]  # Parameters of each test
 
 
@@ -57,12 +55,10 @@ class JointFit:
         return self.point.found
 
 
-def fit_jointly(
-    problems: Sequence[Problem], links: Links, starts: Sequence[Vectors], *, each: Map = map
-) -> JointFit:
-    """Fit tests by `fitting.together.fit_linked` and find the uncertainty; `each` acts as `map`."""
+def fit_jointly(problems: Sequence[Problem], links: Links, starts: Sequence[Vectors]) -> JointFit:
+    """Fit tests by `fitting.together.fit_linked` and find the uncertainty."""
     found = fit_linked(problems, links, starts)
-    errors = errors_of(found, each)
+    errors = errors_of(found)
     point, undrawn, spreads = JointPoint(found, errors), dict[str, Array](), dict[str, Spread]()
     scatter = [name for name in found.own if links.kind(name) == "scatter"]
     for _ in range(ROUNDS if scatter else 0):
@@ -75,7 +71,7 @@ def fit_jointly(
             break
         found = fit_linked(problems, replace(links, pulls=pulls), [found.values])
         point = JointPoint(found, errors, inflations)
-    return JointFit(point, spreads, ranges_of(point, each), correlation_of(point, undrawn))
+    return JointFit(point, spreads, ranges_of(point), correlation_of(point, undrawn))
 
 
 def _spread(point: JointPoint, name: str) -> tuple[Array, Spread, Array, Array] | None:
@@ -140,14 +136,14 @@ def correlation_of(
     return names, correlation(table[complete], errors)
 
 
-def errors_of(found: Together, each: Map = map) -> tuple[tuple[CurveError, ...], ...]:
+def errors_of(found: Together) -> tuple[tuple[CurveError, ...], ...]:
     """Return noise and model error in each curve of each test; see `BestPoint.errors`."""
     point = JointPoint(found)
-    work = [best.to_judge(point.taken(t)) for t, best in enumerate(point.bests)]
-    return tuple(each(curve_errors, *zip(*work, strict=True)))
+    every = enumerate(point.bests)
+    return tuple(curve_errors(*best.to_judge(point.taken(t))) for t, best in every)
 
 
-def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, float]]:
+def ranges_of(point: JointPoint) -> dict[str, tuple[float, float]]:
     """Return ranges of shared values and slopes of rate laws (":b") due to model error.
 
     A range is the hull of two: the 95 % interval of a value found from the same number of other
@@ -157,22 +153,21 @@ def ranges_of(point: JointPoint, each: Map = map) -> dict[str, tuple[float, floa
     """
     if not point.uncertainty.errs:
         return {}
-    out = _over_specimens(point.found, each)
+    out = _over_specimens(point.found)
     shared = [name for name in point.found.shared if point.found.links.kind(name) == "shared"]
-    sides = [(name, sign) for name in shared for sign in (-1.0, 1.0)]
-    held = each(_held, [point] * len(sides), *zip(*sides, strict=True)) if sides else ()
-    for (name, _), end in zip(sides, held, strict=True):
-        ends = [end, point.found.common[name][0], *out.get(name, ())]
+    for name in shared:
+        held = [_held(point, name, sign) for sign in (-1.0, 1.0)]
+        ends = [*held, point.found.common[name][0], *out.get(name, ())]
         out[name] = min(ends), max(ends)
     return out
 
 
-def _over_specimens(found: Together, each: Map) -> dict[str, tuple[float, float]]:
+def _over_specimens(found: Together) -> dict[str, tuple[float, float]]:
     """Return ranges of shared values and slopes from fits without each group of tests."""
     count = len(found.problems)
     groups = [range(first, count, GROUPS) for first in range(min(count, GROUPS))]
     kept = [[t for t in range(count) if t not in group] for group in groups]
-    others = [common for common in each(_without, [found] * len(kept), kept) if common]
+    others = [common for one in kept if (common := _without(found, one))]
     if len(others) < 2:
         return {}
     out, quantile = dict[str, tuple[float, float]](), covariance.half_width(1.0, len(others) - 1)

@@ -23,7 +23,6 @@ from foamfit.report.listing import Row, table_of
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import readable, readable_unit
 from foamfit.report.render import page, words
-from foamfit.report.result_figures import Mapped
 from foamfit.report.shown import Result, brief
 from foamfit.report.studies.parameters import Panel, plot_parameters
 from foamfit.report.tables import MISFITS, formula, frame, parameters_tex, stacked, symbols
@@ -39,8 +38,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Largest number of result folders written in this process: each takes a second or two.
-FEW_FOLDERS = 3
 _NOT_IN_FILE = ("loops", "fits", "fit")  # fields that joint.json does not contain
 MOST_ROWS = 60  # of the table of tests on the terminal
 MOST_LOOPS = 48
@@ -91,7 +88,7 @@ class JointResult(Result):
     sentences: tuple[str, ...] = ()
     runtime_s: float = math.nan
     loops: tuple[Loop, ...] = ()  #: Measured and fitted loop of each test
-    #: Result of each test, or a function that makes it and can run in any process
+    #: Result of each test, or a function that makes it
     fits: tuple[Fit | Callable[[], Fit], ...] = ()
     fit: JointFit | None = None  #: The fit itself; None if the result was read from its folder
 
@@ -142,11 +139,11 @@ class JointResult(Result):
             frames[test] = frame(each, kind=kinds, scatter={}, b={})
         return stacked(frames, "test")
 
-    def _shown(self, *, html: bool = False) -> str:
+    def __repr__(self) -> str:
         """Return name, model, number of tests, status and the common values."""
         line = f"{self.model} · {counted(len(self.tests), 'test')} together · status {self.status}"
         rows = [readable(name, p) for name, p in self.varied.items()]
-        return brief(self.name, line, rows, html)
+        return brief(self.name, line, rows)
 
     def text(self, *, verbose: bool = False) -> str:
         """Return the text that the command prints."""
@@ -156,26 +153,18 @@ class JointResult(Result):
         more: Any = {"parameters": every, "nuisance": NUISANCE, "between": _between}
         return words("joint", found=self, most=MOST_ROWS, curves=curves, **more)
 
-    def write(
-        self, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
-    ) -> None:
+    def write(self, folder: Path, *, pages: bool = True, width: str = TWO) -> None:
         """Write joint.json, its page, its figure, table.tex, and a result folder per test."""
         write_json(folder / "joint.json", self.to_json_dict())
         shown = self.of_springs
         kinds = {name: one.kind for name, one in shown.items()}
         between = {name: _between(one) for name, one in shown.items()}
         write_text(folder / "table.tex", parameters_tex(shown, kinds=kinds, between=between))
-        folders, n = [folder / name for name in self.tests], len(self.tests)
-        # If other processes write these folders, the common figure is drawn at the same time.
-        written = mapped(_write_test, self.fits, folders, [pages] * n, [width] * n)
-        svg = b""
+        for name, one in self.results.items():
+            (folder / name).mkdir()
+            write_result(one, folder / name, pages=pages, width=width)
         if pages:
             svg = figures.write_both(plot_joint(self, width=width), folder / "joint")
-            if width != TWO:  # the page has room for two columns
-                svg = figures.image(plot_joint(self), "svg")
-        for _ in written:
-            pass
-        if pages:
             write_text(folder / "joint.html", joint_page(self, folder, svg))
 
     def to_json_dict(self) -> dict[str, Any]:
@@ -187,11 +176,6 @@ class JointResult(Result):
         for one in shown["parameters"].values():
             one["state"] = one["state"] or None  # of an own parameter
         return shown
-
-
-def _write_test(one: Callable[[], Fit] | Fit, folder: Path, report: bool, width: str) -> None:
-    folder.mkdir()
-    write_result(one if isinstance(one, Fit) else one(), folder, pages=report, width=width)
 
 
 def _between(one: ParameterEstimate) -> str:

@@ -1,7 +1,7 @@
 """An executor of processes on this machine that survives the end of one of them.
 
 `concurrent.futures.ProcessPoolExecutor` cancels all calls when one of its processes ends. Here each
-process has its own pool, so that only the interrupted call is tried again.
+process has its own pool, so that only the interrupted call is lost.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
-from concurrent.futures import ThreadPoolExecutor as Threads
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from functools import partial
@@ -24,15 +23,11 @@ from multiprocessing import connection
 from types import ModuleType
 from typing import Any
 
-from foamfit.errors import check_whole
 from foamfit.terminal import without_ctrl_c
 
-# Modules that are imported by fits, by their pages, by the drawing of figures and by joint fits.
+# Modules that are imported by fits and by their pages.
 FITS = ("foamfit.study.batch_work", "foamfit.data.csv_file", "pandas", "pint")
 PAGES = ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf", "jinja2")
-DRAWING = ("foamfit.report.result_figures", "foamfit.solve.compiled.loop", *PAGES)
-_JOINT = ("foamfit.study.joint", "foamfit.report.plots", *PAGES)
-ATTEMPTS = 2  # number of attempts of a call whose process ends
 # One thread per process, as there is one process per core.
 ONE_THREAD = {
     f"{name}_NUM_THREADS": "1"
@@ -42,7 +37,7 @@ _STARTING, _SCRIPT = threading.Lock(), ModuleType("__main__")
 
 
 class EndedError(RuntimeError):
-    """The process of a call ended in every attempt."""
+    """The process of a call ended before the call was done."""
 
 
 def cores() -> int:
@@ -51,43 +46,34 @@ def cores() -> int:
     return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
-def prepare(preload: Iterable[str]) -> None:
-    """Start importing modules in the fork server, from which new processes are forked.
-
-    The imports run in parallel with this process. Does nothing on systems without a fork server.
-    """
-    if "forkserver" in multiprocessing.get_all_start_methods():
-        from multiprocessing import forkserver
-
-        with _starting(), without_ctrl_c():  # Ctrl-C must not end the server during its imports
-            forkserver.set_forkserver_preload(list(preload))
-            forkserver.ensure_running()
-
-
-class Processes(Executor):
+class Processes(ThreadPoolExecutor):
     """An executor with `count` single-threaded processes, which end with their parent process.
 
-    A call whose process ends is repeated in a new process, with `ATTEMPTS` attempts in total, and
-    then raises `EndedError`; other calls are not affected. Functions must be defined in modules.
-    The running script is not imported again and needs no guard. For `preload` see `prepare`.
+    A call whose process ends raises `EndedError`; other calls are not affected. Functions must be
+    defined in modules. The running script is not imported again and needs no guard. `preload` are
+    modules that the server imports from which processes are forked, where there is one.
     """
 
-    def __init__(self, count: int, preload: tuple[str, ...] = ()) -> None:
+    def __init__(self, count: int, preload: Iterable[str] = ()) -> None:
+        super().__init__(count, thread_name_prefix="foamfit")
         server = "forkserver" in multiprocessing.get_all_start_methods()
         self._context: Any = multiprocessing.get_context("forkserver" if server else "spawn")
-        prepare(preload)
-        self._threads = Threads(count, thread_name_prefix="foamfit")
+        if server:
+            from multiprocessing import forkserver  # not on Windows
+
+            with _starting(), without_ctrl_c():  # Ctrl-C must not end the server in its imports
+                forkserver.set_forkserver_preload(list(preload))
+                forkserver.ensure_running()
         self._pools = dict[int, ProcessPoolExecutor]()  # by the thread that uses it
         self._stop, self._stopping = self._context.Pipe(duplex=False)
-        self._stopped = False
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Schedule the call of a function in one of the processes."""
-        return self._threads.submit(self._call, partial(fn, *args, **kwargs))
+        return super().submit(self._call, partial(fn, *args, **kwargs))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes after their current calls."""
-        self._threads.shutdown(wait, cancel_futures=cancel_futures)
+        super().shutdown(wait, cancel_futures=cancel_futures)
         for pool in list(self._pools.values()):
             pool.shutdown(wait)
         self._stopping.close()
@@ -95,52 +81,26 @@ class Processes(Executor):
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """End the processes, at once after an exception."""
-        self.shutdown() if kind is None else self.stop()
-
-    def stop(self) -> None:
-        """End the processes at once, without waiting for their calls."""
-        self._stopped = True
-        self._stopping.close()
-        self.shutdown(cancel_futures=True)
+        if kind is not None:
+            self._stopping.close()
+        self.shutdown(cancel_futures=kind is not None)
 
     def _call(self, work: Callable[[], Any]) -> Any:
-        """Run a call in the process of the current thread, which is one of `_threads`."""
+        """Run a call in the process of the current thread."""
         from foamfit.springs import laws
 
         thread = threading.get_ident()
-        for _ in range(ATTEMPTS):
-            if self._stopped:
-                break
-            new = thread not in self._pools
-            if new:
-                arguments = self._stop, laws.texts()
-                self._pools[thread] = ProcessPoolExecutor(1, self._context, _begin, arguments)
-            try:
-                with _starting() if new else nullcontext():
-                    future = self._pools[thread].submit(work)
-                return future.result()
-            except BrokenProcessPool:
-                self._pools.pop(thread).shutdown()
-        if self._stopped:
-            raise CancelledError
-        raise EndedError(f"its process ended {ATTEMPTS} times before it was done")
-
-
-@contextmanager
-def workers(jobs: int | None, count: int, few: int) -> Iterator[Callable[..., Iterable[Any]]]:
-    """Yield a `map` for `count` pieces of work in `jobs` processes (None: one per core).
-
-    It is the built-in `map` for one job or up to `few` pieces of work, because starting a process
-    takes some seconds. The processes start at the first call, and their imports at once.
-    """
-    if jobs is not None:
-        check_whole("jobs", jobs, 1)
-    wanted = 1 if count <= few else min(cores() if jobs is None else jobs, count)
-    if wanted < 2:
-        yield map
-        return
-    with Processes(wanted, _JOINT) as pool:
-        yield pool.map
+        new = thread not in self._pools
+        if new:
+            given = self._stop, laws.texts()
+            self._pools[thread] = ProcessPoolExecutor(1, self._context, _begin, given)
+        try:
+            with _starting() if new else nullcontext():
+                future = self._pools[thread].submit(work)
+            return future.result()
+        except BrokenProcessPool:
+            self._pools.pop(thread).shutdown()
+            raise EndedError("its process ended before it was done") from None
 
 
 @contextmanager

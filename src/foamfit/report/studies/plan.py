@@ -20,8 +20,7 @@ from foamfit.report.figures import BLUE, GREY, TWO, VERMILION
 from foamfit.report.folder import write_json, write_text
 from foamfit.report.readable import own_name
 from foamfit.report.render import page, sentences, words
-from foamfit.report.result_figures import Mapped
-from foamfit.report.shown import Result, told
+from foamfit.report.shown import Result
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import unit_of
 from foamfit.text import engineering
@@ -160,9 +159,9 @@ class Plan(Result):
 
     _replaces = "plan.json"
 
-    def _shown(self, *, html: bool = False) -> str:
+    def __repr__(self) -> str:
         """Return the advice."""
-        return told(f"{self.name}: which test next?", self.sentences, html)
+        return "\n  ".join((f"{self.name}: which test next?", *self.sentences))
 
     def table(self) -> pd.DataFrame:
         """Return a row for each test: settings, risk, expected number and widths (SI)."""
@@ -225,9 +224,7 @@ class Plan(Result):
         """Return the text that the command prints."""
         return words("plan_terminal", plan=self)
 
-    def write(
-        self, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
-    ) -> None:
+    def write(self, folder: Path, *, pages: bool = True, width: str = TWO) -> None:
         """Write plan.json, plan.html, plan.png, plan.pdf, next.toml and joint.toml."""
         write_json(folder / "plan.json", self.to_json_dict())
         if self.advice is not None:

@@ -21,8 +21,7 @@ from foamfit.report.folder import write_columns, write_json
 from foamfit.report.panels import Line, Panel, measured
 from foamfit.report.plots import panelled
 from foamfit.report.render import words
-from foamfit.report.result_figures import Mapped
-from foamfit.report.shown import Result, told
+from foamfit.report.shown import Result
 from foamfit.results import flags_of
 from foamfit.springs.model import Model
 from foamfit.text import percent
@@ -123,9 +122,10 @@ class Prediction(Result):
 
     _replaces = "prediction.json"  # a result of another kind may be its source
 
-    def _shown(self, *, html: bool = False) -> str:
+    def __repr__(self) -> str:
         """Return the sentences on the prediction."""
-        return told(f"{self.measurement.name} predicted from {self.source}", self.sentences, html)
+        title = f"{self.measurement.name} predicted from {self.source}"
+        return "\n  ".join((title, *self.sentences))
 
     def text(self, *, verbose: bool = False) -> str:
         """Return the text that the command prints, with half widths relative to the range."""
@@ -133,9 +133,7 @@ class Prediction(Result):
         parts = [part for part in COLOURS if any(part in one.parts for one in every)]
         return words("prediction", found=self, parts=parts)
 
-    def write(
-        self, folder: Path, *, pages: bool = True, width: str = TWO, mapped: Mapped = map
-    ) -> None:
+    def write(self, folder: Path, *, pages: bool = True, width: str = TWO) -> None:
         """Write ``prediction.json``, ``.csv``, ``.png`` and ``.pdf`` into an existing folder."""
         write_json(folder / "prediction.json", self.to_json_dict())
         write_columns(folder / "prediction.csv", self.columns)
