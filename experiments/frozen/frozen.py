@@ -129,7 +129,7 @@ def together(folder: Path) -> Iterator[Row]:
     study = studies.write_study(
         folder / "STUDY.toml", ["loop-*.csv"], "microscale", KINDS, drive="displacement"
     )
-    found = ff.joint(study, jobs=1)
+    found = ff.joint(study)
     for name, one in found.parameters.items():
         yield "joint", f"{name} value", repr(float(one.value))
         if one.ci95 is not None:

@@ -62,7 +62,7 @@ def four(draws: int, folder: Path) -> Iterator[Row]:
         rng = np.random.default_rng([1, draw])
         for i in range(4):
             write_test(folder / f"t{i}.csv", 0.1, rng)
-        joint = ff.joint(write_study(folder, SHARED), jobs=1)
+        joint = ff.joint(write_study(folder, SHARED))
         test = ff.read_test(folder / "t0.csv", folder / "foam.toml")
         alone = ff.fit(test, model="microscale", drive="displacement", intervals="local")
         pairs = [(joint.parameters[f"s1_{n}"], alone.parameters[f"s1_{n}"]) for n in SPRING]
@@ -83,7 +83,7 @@ def scatter(draws: int, folder: Path, spread: float) -> Iterator[Row]:
         for i in range(8):
             own = SPRING["k0"] * np.exp(spread * rng.standard_normal())
             write_test(folder / f"t{i}.csv", 0.1, rng, k0=own)
-        found.append(ff.joint(write_study(folder, kinds), jobs=1).parameters["s1_k0"])
+        found.append(ff.joint(write_study(folder, kinds)).parameters["s1_k0"])
     row: Row = {"study": f"scatter {spread:g}", "draws": draws}
     common = studies.share([holds(one.ci95, SPRING["k0"]) for one in found])
     yield row | {"what": "common value"} | common
@@ -101,7 +101,7 @@ def rates(draws: int, folder: Path, kind: str, slope: float) -> Iterator[Row]:
             x = np.log(rate / RATES[2])
             factor = 1.0 + slope * x if kind == "log rate" else np.exp(slope * x)
             write_test(folder / f"t{i}.csv", rate, rng, sigma_plus=factor * truth)
-        result = ff.joint(write_study(folder, SHARED | {"sigma_plus": kind}), jobs=1)
+        result = ff.joint(write_study(folder, SHARED | {"sigma_plus": kind}))
         found.append(result.parameters["s1_sigma_plus"])
         chosen.append(min(result.evidence, key=lambda alternative: alternative.bic).kind)
     for what, off, held in (

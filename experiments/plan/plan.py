@@ -161,7 +161,7 @@ def together(
     )  # fmt: skip
     began = time.perf_counter()
     try:
-        found = ff.joint(study, jobs=1)
+        found = ff.joint(study)
     except (InputError, SimulationError) as error:
         yield {"error": str(error)}
         return

@@ -63,7 +63,7 @@ def relaxation(data: Path, folder: Path) -> Iterator[Row]:
             folder / f"{rate}.toml", [paths["2s"].name, paths[rate].name], "microscale",
             {"g1": "shared", "tau1": "shared"}, name=rate, relaxation=1,
         )  # fmt: skip
-        joint = ff.joint(study, jobs=1)
+        joint = ff.joint(study)
         alone = ff.fit(ff.read_test(paths[rate]), model="microscale", relaxation=1)
         test = f"test at {RATES[rate]:g} 1/s"
         for name in ("s1_g1", "s1_tau1"):

@@ -41,7 +41,7 @@ def predicted(
         folder / "study.toml", [name_of(group, i) for i in fitted], "microscale", kinds,
         relaxation=1, drive="displacement", name=f"{group} heel",
     )  # fmt: skip
-    result, rows = ff.joint(study, jobs=1), []
+    result, rows = ff.joint(study), []
     every = {i: ff.read_test(folder / name_of(group, i)) for i in (*fitted, *left)}
     for i in left:
         found = ff.predict(result, every[i])

@@ -69,7 +69,7 @@ def test_the_toml_may_have_priors(impact: ff.Measurement, tmp_path: Path) -> Non
     study = tmp_path / "study.toml"
     study.write_text('name = "x"\ntests = ["*.csv"]\nmodel = "bistable"\n')
     with pytest.raises(ff.InputError, match=r"a joint fit accepts no \[priors\]"):
-        ff.joint(study, jobs=1)
+        ff.joint(study)
     write_measurement(path, impact, "[priors]\ns1_k0 = 4e6\n")
     with pytest.raises(ff.InputError, match=r"\[priors\] s1_k0 = 4000000.0 must be like "):
         ff.read_test(path)
