@@ -23,8 +23,8 @@ from foamfit.springs import laws
 from foamfit.springs.parameters import NUISANCE
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import records
 import studies
-from real_foams import SHOE_FOAM
 
 HERE = Path(__file__).parent
 sys.path.append(str(HERE.parents[1] / "notebooks"))  # of bouc_wen.py
@@ -72,38 +72,20 @@ TESTS = (
     (MYCELIUM, "outplane-4s-1", "outplane-4s-2"),
     (LATTICE, "tpu87-20 cycle 10", "tpu87-20 cycle 100"),
     (LATTICE, "tpu87-50 cycle 10", "tpu87-50 cycle 100"),
-    (IMPACT, "test_1_impact", "test_3_impact"),
+    (IMPACT, "cartilage 1", "cartilage 3"),
 )
-SHOWN = ("turbo-comp-1", "outplane-4s-1", "tpu87-20 cycle 10", "test_1_impact")
-STRIKER = '[striker]\nmass = "358.39 g"\nvelocity = "{velocity} m/s"\n'
-VELOCITY = {"test_1_impact": 0.785, "test_3_impact": 0.905}  # m/s
+SHOWN = ("turbo-comp-1", "outplane-4s-1", "tpu87-20 cycle 10", "cartilage 1")
 
 
 # ------------------------------------------------------------------------------- the tests
 
 
-def read(group: str, name: str, data: Path, folder: Path) -> ff.Measurement:
+def read(name: str, folder: Path) -> ff.Measurement:
     """Read a test like a user, and thin it."""
-    toml, cycle = folder / "specimen.toml", None
-    if name in SHOE_FOAM:
-        path = data / "shoe-foam" / f"{name}_cycle1.csv"
-        studies.write_specimen(toml, *SHOE_FOAM[name], "")
-    elif group == FOAM:
-        sizes = {one: size for one, *size in studies.twins(data / "shoe-foam-twins")}
-        path = data / "shoe-foam-twins" / f"{name}_raw.txt"
-        studies.write_specimen(toml, *sizes[name])
-    elif group == MYCELIUM:
-        path = data / "mycelium-rates" / f"{name}_raw.txt"
-        toml = studies.mycelium(path, folder)
-    elif group == LATTICE:
-        stem, _, number = name.split()
-        path, cycle = data / "lattice-cycles" / f"{stem}_raw.csv", int(number)
-        studies.write_specimen(toml, "12 mm", "20 mm", studies.LATTICE)
-    else:
-        path = data / "cartilage-impact" / f"{name}.csv"
-        studies.write_specimen(toml, "0.563 mm", "8.5 mm", "")
-        toml.write_text(toml.read_text() + STRIKER.format(velocity=VELOCITY[name]))
-    return thinned(ff.read_test(path, toml, cycle=cycle), folder / f"{name}.csv")
+    record, _, cycle = name.partition(" cycle ")
+    path = records.place(record, folder)
+    test = ff.read_test(path, cycle=int(cycle) if cycle else None)
+    return thinned(test, folder / f"{name}.csv")
 
 
 def thinned(test: ff.Measurement, path: Path) -> ff.Measurement:
@@ -121,12 +103,12 @@ def thinned(test: ff.Measurement, path: Path) -> ff.Measurement:
 # ------------------------------------------------------------------------------- the fits
 
 
-def fit_all(case: tuple[str, str, str], data: Path, starts: int) -> list[dict[str, Any]]:
+def fit_all(case: tuple[str, str, str], starts: int) -> list[dict[str, Any]]:
     """Fit one test by every law and predict the unseen test; return rows with curves."""
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         folder, (group, name, other) = Path(temporary), case
-        test, held_out = (read(group, one, data, folder) for one in (name, other))
+        test, held_out = (read(one, folder) for one in (name, other))
         for law in LAWS:
             if law.file and not laws.is_registered(law.model):
                 ff.register(importlib.import_module(law.file).LAW)
@@ -221,7 +203,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
                 fontsize=7,
             )  # fmt: skip
             if column == 0:
-                ax.set_ylabel(f"{name.removesuffix('_impact')}\nstress ({unit})", fontsize=7)
+                ax.set_ylabel(f"{name}\nstress ({unit})", fontsize=7)
         figure.suptitle(
             "Measured (grey; shoe foam arXiv:2602.12694, mycelium LivingMatterLab/CANN, lattice "
             "mev43/FYP-Cyclic-Compression, cartilage JoVE 64450), fitted (red), misfit",
@@ -247,12 +229,12 @@ def main() -> None:
 
 def fit_tests(given: argparse.Namespace) -> None:
     """Fit all tests; write the table and the figure."""
-    data = studies.measurements(
+    studies.measurements(
         "shoe-foam", "shoe-foam-twins", "mycelium-rates", "lattice-cycles", "cartilage-impact"
     )
     cases = [case for case in TESTS if given.only in case[1]]
     rows = list[dict[str, Any]]()
-    jobs = [(case, data, given.starts) for case in cases]
+    jobs = [(case, given.starts) for case in cases]
     for more in studies.in_order(fit_all, jobs, given.jobs):
         rows += more  # an interrupted study keeps its rows
         table = pd.DataFrame(rows).drop(columns="curves")

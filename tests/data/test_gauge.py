@@ -1,11 +1,10 @@
 """A gauge that sticks and then jumps is detected and bridged, without false detections."""
 
-import csv
-
 import numpy as np
 import pytest
 
-from conftest import DATA, needs_data, specimen_toml
+import records
+from conftest import DATA, needs_data
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Record, Specimen
 from foamfit.data.prepare import condition
@@ -181,11 +180,8 @@ def test_a_gauge_that_slips_after_a_hold_at_constant_stress_has_not_stood_still(
 @needs_data
 def test_the_gauge_of_the_shoe_foams_stands_still_at_the_top(tmp_path):
     """In ten tests (arXiv:2602.12694) 34 to 76 samples stand still before a jump of 0.4 to 1 %."""
-    with (DATA / "shoe-foam-twins" / "specimens.csv").open() as table:
-        specimens = list(csv.DictReader(table))
-    for specimen in specimens[::3]:
-        toml = specimen_toml(tmp_path, specimen["height_mm"], specimen["diameter_mm"])
-        test = read_test(DATA / "shoe-foam-twins" / f"{specimen['test']}_raw.txt", toml)
+    for name in records.HEELS[::3]:
+        test = read_test(records.place(name, tmp_path, DATA))
         (note,) = notes(test)
         ((start, end),) = test.standstills
         (dropped,) = (item for item in test.rows.dropped if "stands still" in item.why)
