@@ -71,17 +71,18 @@ def error(done, clock=0.0):
     return done.origins["contact_time"] - clock
 
 
+CHANNELS = ["F", "A", "FA", "FW", "AW"]
 ZEROS = [(0.0, 0.0, 0.0), (-0.9, 0.7, 0.4), (0.8, -1.0, -0.6)]
 
 
-@pytest.mark.parametrize("channels", ["F", "A", "FA", "FW", "AW"])
+@pytest.mark.parametrize("channels", CHANNELS)
 @pytest.mark.parametrize("gauge", ["flight", "rest"])
 @pytest.mark.parametrize("tau", [1, 8])
 @pytest.mark.parametrize(("n", "before"), [(80, 40), (500, 150), (500, 2000), (8000, 3000)])
 def test_the_start_is_found_within_samples_or_a_few_percent(channels, gauge, tau, n, before):
-    # All combinations of noise level and zero; for long records one zero per level, to save time.
-    pairs = [(i, j) for i in range(3) for j in range(3) if n < 8000 or i == j]
-    for i, j in pairs:
+    # One zero for each noise level, which differ between channels: so every pair is covered.
+    shift = CHANNELS.index(channels)
+    for i, j in ((i, (i + shift) % 3) for i in range(3)):
         level, zeros, seed = (5e-4, 5e-3, 0.02)[i], ZEROS[j], 3 * i + j
         clock = (0.0, 12.5, -3.0)[seed % 3]
         given = record(channels, n, before, 0.37, level, tau, gauge, seed, clock, zeros)

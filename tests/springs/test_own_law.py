@@ -169,20 +169,20 @@ def test_a_registered_copy_agrees_with_the_built_in_law(
             np.testing.assert_allclose(b, a, 0, bar, err_msg=f"{kind}, {name}")
 
 
-# Weights of the central differences of order 8.
-WEIGHTS = np.array([4 / 5, -1 / 5, 4 / 105, -1 / 280])
+# Weights of the central differences of order 4.
+WEIGHTS = np.array([2 / 3, -1 / 12])
 
 
 @pytest.mark.parametrize("place", ["alone", "in series", "below a mass"])
 @pytest.mark.parametrize("drive", ["impact", "stress", "displacement"])
 def test_derivatives_are_exact(bouc_wen: Law, drive: str, place: str) -> None:
-    """They agree with differences of order 8, except at kinks of the curves."""
+    """They agree with differences of order 4, except at kinks of the curves."""
     given = {
         "impact": ff.Impact(0.05, 3.0),
         "stress": ff.StressDrive(4e5 * SHAPE + 1e4),
         "displacement": ff.DisplacementDrive(4e-3 * SHAPE + 1e-4),
     }[drive]
-    time = 3.0 * TIME if drive == "impact" else 1e3 * TIME
+    time = (3.0 if drive == "impact" else 100.0) * TIME
 
     def run(values: np.ndarray, rtol: float, **more: object) -> ff.Response:
         own = bouc_wen.make((*values, 30.0), ((0.3, 2e-4),))
@@ -293,14 +293,14 @@ def _agree(got: ff.Response, want: ff.Response, names: dict[str, str], bar: floa
 
 
 def test_variables_that_decay_are_as_exact_as_relaxation(bouc_wen: Law) -> None:
-    terms = [(0.3, 1e-6), (0.5, 0.02), (0.2, 0.7)]
+    terms = [(0.3, 1e-6), (0.2, 0.7)]
     time = np.linspace(0.0, 1.0, 301)
     drive = ff.DisplacementDrive(HEIGHT * 0.4 * np.sin(3.0 * time) ** 2)
     names = {"s1_k": "s1_k", "s1_height": "s1_height"}
-    for k in range(3):
+    for k in range(2):
         names |= {f"s1_s{k}": f"s1_g{k + 1}", f"s1_t{k}": f"s1_tau{k + 1}"}
     springs = (
-        prony(3).make([2e6, *np.transpose(terms).ravel(), 0.0], ()),
+        prony(2).make([2e6, *np.transpose(terms).ravel(), 0.0], ()),
         prony(0).make([2e6, 0.0], terms),
     )
     got, want = (
