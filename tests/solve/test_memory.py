@@ -208,6 +208,8 @@ def test_derivatives_by_all_parameters_are_those_of_differences(name: str) -> No
                 got = getattr(run.sensitivities[short], what)
                 size = max(np.abs(got).max(), 2e-5 * np.abs(getattr(run, what)).max() / abs(value))
                 misses[-1].append(np.abs(wanted - got)[..., away].max() / size)
+            if np.min(misses, axis=0).max() < 1e-6:
+                break
         assert np.min(misses, axis=0).max() < 1e-6, short
 
 
