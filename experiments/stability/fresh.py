@@ -17,7 +17,6 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -41,15 +40,11 @@ BAD, POOR = 3.0, 1.0  # error over rtol
 SLOPE_BAR = 1e-3  # allowed error of a derivative over its range, for rtol up to 1e-5
 
 
-def follower(scene: Scene, spec: Spec) -> Callable[[Any, Any, Array, float, int], Truth]:
-    """Return the judge of a scene."""
-    if spec.get("judge") == "roots":
-        import roots  # only this judge needs mpmath
+def by_roots(scene: Scene) -> Truth:
+    """Return the solution of the judge that integrates nothing."""
+    import roots  # only this judge needs mpmath
 
-        return roots.follow
-    if isinstance(scene[1], ff.Impact):
-        return follow
-    return lambda chain, drive, time, *bounds: follow(chain, drive, time - time[0], *bounds)
+    return roots.follow(*scene)
 
 
 # ------------------------------------------------------------------------------- the derivatives
@@ -90,7 +85,8 @@ def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[n
                 scene = scene_from(other)
             except ValueError:  # the scene is at the limit of admissible parameters
                 return None
-            truth = follower(scene, spec)(*scene, LOOSE, most)
+            rooted = spec.get("judge") == "roots"
+            truth = by_roots(scene) if rooted else follow(*scene, LOOSE, most)
             if truth.why:
                 return None
             sides.append(np.vstack((truth.base_stress, truth.displacement)))
@@ -157,7 +153,7 @@ def lines_of(
     spec, most = spec_of(family, number), most or MOST.get(family, USUAL_MOST)
     scene = scene_from(spec)
     began = time.perf_counter()
-    truth = judge(*scene, most, follower(scene, spec))
+    truth = by_roots(scene) if spec.get("judge") == "roots" else judge(*scene, most)
     took = time.perf_counter() - began
     known: dict[str, Any] = {}
     lines = [
