@@ -12,6 +12,7 @@ import importlib
 import sys
 import tempfile
 import time
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -148,29 +149,14 @@ def predicted(result: Any, test: ff.Measurement) -> dict[str, float]:
 
 def law_table(table: pd.DataFrame) -> str:
     """Return the table of the README: for each law, misfit and predicted misfit by group."""
-    rows = []
-    groups = list(dict.fromkeys(group for group, *_ in TESTS))
-    fitted = {group: set(table[table["group"] == group]["test"]) or {""} for group in groups}
-    best = {
-        (group, one): table[table["group"] == group].groupby("law")[one].mean().min()
-        for group in groups
-        for one in MEASURES
-    }
-    for law in LAWS:
-        own = table[table["law"] == law.name]
-        if own.empty:
-            continue
-        cells = []
-        for group in groups:
-            part = own[own["group"] == group]
-            if len(part) < len(fitted[group]):  # a study that was interrupted
-                cells.append("–")
-                continue
-            both = {one: part[one].mean() for one in MEASURES}
-            bold = {one: "**" * bool(v == best[group, one]) for one, v in both.items()}
-            cells.append(" / ".join(f"{bold[n]}{100.0 * v:.2f}{bold[n]}" for n, v in both.items()))
+    groups, rows = table["group"].unique(), []
+    means = table.pivot_table(index="law", columns="group", values=list(MEASURES), sort=False)
+    text = (100.0 * means).map("{:.2f}".format)
+    text = text.where(means != means.min(), "**" + text + "**")
+    for law, own in table.groupby("law", sort=False):
+        cells = (" / ".join(text.loc[law, (one, group)] for one in MEASURES) for group in groups)
         rows.append([
-            law.name, own["parameters"].iloc[0], *cells,
+            law, own["parameters"].iloc[0], *cells,
             f"{own['determined'].mean():.1f}", f"{own['seconds'].median():.1f} s",
         ])  # fmt: skip
     return studies.markdown(["law", "parameters", *groups, "determined", "run time"], rows)
@@ -183,17 +169,14 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     tests = [name for name in SHOWN if any(test == name for test, _ in found)]
     with studies.sheet(path, 1.55 * len(names), 1.5 * len(tests) + 0.5) as figure:
         axes = figure.subplots(len(tests), len(names), sharey="row", sharex="row", squeeze=False)
-        for (name, line), column in ((one, k) for one in zip(tests, axes, strict=True)
-                                     for k in range(len(names))):  # fmt: skip
-            row, ax = found.get((name, names[column])), line[column]
+        for (i, name), (column, law) in product(enumerate(tests), enumerate(names)):
+            row, ax = found[name, law], axes[i, column]
             if name == tests[0]:
-                title = names[column].replace(": ", ":\n").replace(", ", ",\n")
+                title = law.replace(": ", ":\n").replace(", ", ",\n")
                 title = title.replace(" on ", "\non ").replace(" beside ", "\nbeside ")
                 ax.set_title(title, fontsize=6.5)
             if name == tests[-1]:
                 ax.set_xlabel("strain (–)")
-            if row is None:  # a study that was interrupted
-                continue
             strain, measured, fitted = row["curves"]
             factor, unit = (1e6, "MPa") if measured.max() > 1e6 else (1e3, "kPa")
             ax.plot(strain, measured / factor, color="0.6", lw=1.6)
