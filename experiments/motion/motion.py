@@ -142,7 +142,7 @@ def sampled(rng: np.random.Generator, rows: int) -> np.ndarray:
     return t
 
 
-def matched(motion: Motion, turns: np.ndarray, t: np.ndarray) -> list[tuple[int, int]]:
+def matched(motion: Motion, turns: np.ndarray) -> list[tuple[int, int]]:
     """Pair true and found turning points of one kind, each closer than the next true one."""
     ends = np.concatenate([[0.0], motion.turns, [1.0]])
     pairs, taken = [], set()
@@ -172,7 +172,7 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterato
     near = np.any(np.abs(t[:, None] - motion.turns) < NEAR, axis=1)
     for a, b in motion.holds:
         near |= (t > a - NEAR) & (t < b + NEAR)
-    pairs = matched(motion, found.turns, t)
+    pairs = matched(motion, found.turns)
     fine = np.linspace(0.0, 1.0, 7 * rows)
     steps = np.diff(found.at(np.union1d(fine, found.turns)))
     stretch = np.searchsorted(found.turns, np.union1d(fine, found.turns)[:-1], side="right")
