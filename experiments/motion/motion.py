@@ -189,22 +189,24 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterato
         "invented": len(found.turns) - len(pairs), "back": back,
         "modes": found.modes(t[:1]).shape[1],
     }  # fmt: skip
-    sizes = np.abs(np.diff(motion.at(np.concatenate([[0.0], motion.turns, [1.0]]))))
-    for i, at in enumerate(motion.turns):
+    ends = np.concatenate([[0.0], motion.turns, [1.0]])
+    heights = motion.at(ends)
+    sizes, lasts = np.abs(np.diff(heights)), np.diff(ends)
+    for i, (at, height) in enumerate(zip(motion.turns, heights[1:-1], strict=True)):
         j = dict(pairs).get(i)
-        size = min(sizes[i], sizes[i + 1])
-        turn = row | {"what": "turn", "size": size / noise, "found": j is not None}
-        ends = np.concatenate([[0.0], motion.turns, [1.0]])
-        turn |= {"samples": rows * min(np.diff(ends)[i : i + 2])}
+        turn = row | {
+            "what": "turn", "size": min(sizes[i : i + 2]) / noise, "found": j is not None,
+            "samples": rows * min(lasts[i : i + 2]),
+        }  # fmt: skip
         if j is not None:
             here = found.turns[j : j + 1]
-            sign = 1.0 if motion.at(np.array(at)) > motion.at(np.array(ends[i])) else -1.0
-            error = float(found.at(here)[0] - motion.at(np.array(at)))
-            turn |= {"height": sign * error / noise,
-                     "height_z": sign * error / np.linalg.norm(found.modes(here))}  # fmt: skip
+            over = float(np.sign(height - heights[i]) * (found.at(here)[0] - height))
+            turn["height"], turn["height_z"] = (
+                over / noise,
+                over / np.linalg.norm(found.modes(here)),
+            )
             if not motion.holds:
-                late = float(here[0] - at)
-                turn |= {"late": late * rows}
+                turn["late"] = rows * float(here[0] - at)
         yield turn
 
 
