@@ -111,9 +111,8 @@ def test_power_law_damper_adds_a_power_of_the_rate():
 
 def test_a_law_that_depends_on_time_needs_one(tmp_path):
     law("fractional")
-    path = tmp_path / "t.csv"
-    strain = np.linspace(0.0, 0.5, 40)
-    write_csv(path, "strain,stress (Pa)", strain, stress(strain, **CURVE))
-    path.with_suffix(".toml").write_text('[specimen]\nheight = "10 mm"\narea = "1 cm^2"\n')
+    path, strain = tmp_path / "t.csv", np.linspace(0.0, 0.5, 40)
+    toml = '[specimen]\nheight = "10 mm"\narea = "1 cm^2"\n'
+    write_csv(path, "strain,stress (Pa)", strain, stress(strain, **CURVE), toml=toml)
     with pytest.raises(ff.InputError, match="'fractional' needs a time column"):
         ff.fit(ff.read_test(path), model="fractional")

@@ -201,10 +201,8 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterato
         if j is not None:
             here = found.turns[j : j + 1]
             over = float(np.sign(height - heights[i]) * (found.at(here)[0] - height))
-            turn["height"], turn["height_z"] = (
-                over / noise,
-                over / np.linalg.norm(found.modes(here)),
-            )
+            turn["height"] = over / noise
+            turn["height_z"] = over / np.linalg.norm(found.modes(here))
             if not motion.holds:
                 turn["late"] = rows * float(here[0] - at)
         yield turn

@@ -10,6 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 import rig
+from conftest import write_csv
 from foamfit.data.csv_file import read_test
 from foamfit.data.energy import audit
 from foamfit.data.measurement import NoiseLevel, Record, Specimen, Striker
@@ -201,13 +202,11 @@ def test_a_motion_counts_before_contact_only_in_flight():
 
 
 def write(folder, header, *columns, velocity=f"{VELOCITY} m/s"):
-    path = folder / "test.csv"
-    np.savetxt(path, np.column_stack(columns), delimiter=",", header=header, comments="")
-    path.with_suffix(".toml").write_text(
+    toml = (
         f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n'
         f'[striker]\nmass = "{MASS} kg"\nvelocity = "{velocity}"\n'
     )
-    return path
+    return write_csv(folder / "test.csv", header, *columns, fmt="%.18e", toml=toml)
 
 
 @pytest.mark.parametrize("gauge", ["flight", "rest", "rest after it too"])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import records
-from conftest import DATA, needs_data
+from conftest import DATA, needs_data, write_csv
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Record, Specimen
 from foamfit.data.prepare import condition
@@ -50,13 +50,8 @@ def recorded(folder, shown, stress, *, noise=(0.0, 0.0), timed=True, seed=0):
     columns = {"displacement (mm)": shown, "stress (kPa)": stress}
     if timed:
         columns = {"time (s)": STEP * np.arange(shown.size)} | columns
-    path = folder / "test.csv"
-    np.savetxt(
-        path, np.column_stack(list(columns.values())), delimiter=",", header=",".join(columns),
-        comments="", fmt="%.9g",
-    )  # fmt: skip
-    path.with_suffix(".toml").write_text(SPECIMEN)
-    return read_test(path)
+    path, head = folder / "test.csv", ",".join(columns)
+    return read_test(write_csv(path, head, *columns.values(), toml=SPECIMEN))
 
 
 def conditioned(shown, stress, noise):
