@@ -34,13 +34,6 @@ sys.path += sorted(str(place) for place in HERE.iterdir() if place.is_dir())
 
 # Parameters of a microscale spring, without stiffening, softening and weakening.
 MICROSCALE = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
-# Columns of third-party measurements: gap of a machine, and printed lattices.
-GAP = 'displacement = { column = "Gap (um)", counts_down = true }'
-LATTICE = """\
-time = { column = "Total Time (s)" }
-displacement = { column = "Position(Linear:Position) (mm)", counts_down = true }
-force = { column = "Force(Linear:Load) (kN)", scale = -1 }
-cycle = { column = "Total Cycles" }"""
 # Colours of Okabe and Ito, safe for colour-blind readers.
 BLACK, GREY, BLUE, SKY = "#000000", "#8c8c8c", "#0072B2", "#56B4E9"
 VERMILION, ORANGE, GREEN, PURPLE = "#D55E00", "#E69F00", "#009E73", "#CC79A7"
@@ -204,16 +197,6 @@ def at_shares(
 # ------------------------------------------------------------------------------- files of tests
 
 
-def write_specimen(path: Path, height: str, diameter: str, columns: str = GAP) -> Path:
-    """Write the TOML of a cylinder and its columns; return the path.
-
-    By default the displacement is the gap between the plates, as in most third-party records.
-    """
-    text = f'[specimen]\nheight = "{height}"\ndiameter = "{diameter}"\n'
-    path.write_text(text + (f"[columns]\n{columns}\n" if columns else ""), encoding="utf-8")
-    return path
-
-
 def write_test(path: Path, toml: str | None = None, **columns: Iterable[float]) -> Path:
     """Write a synthetic test (`time`, `stress`, `displacement` in SI) and its TOML."""
     units = {"time": "s", "stress": "Pa", "displacement": "m"}
@@ -246,25 +229,3 @@ def write_study(
         text += ["", f"[{name}]", *(f"{key} = {quoted(value)}" for key, value in table.items())]
     path.write_text("\n".join(text) + "\n", encoding="utf-8")
     return path
-
-
-def mycelium(record: Path, folder: Path) -> Path:
-    """Write the TOML of a test of mycelium-rates/, whose header states the height; return its path.
-
-    The test has the name of its file.
-    """
-    gap = record.read_text(encoding="utf-8").splitlines()[1].split("\t")[5].strip()
-    return write_specimen(folder / f"{record.stem}.toml", f"{gap} um", "8 mm")
-
-
-def twins(data: Path) -> Iterator[tuple[str, str, str]]:
-    """Yield name, height and diameter of each specimen of shoe-foam-twins/."""
-    for row in pd.read_csv(data / "specimens.csv", dtype=str).itertuples():
-        yield row.test, f"{row.height_mm} mm", f"{row.diameter_mm} mm"
-
-
-def place_twins(data: Path, folder: Path) -> None:
-    """Link the tests of shoe-foam-twins/ into a folder and write a TOML for each."""
-    for test, height, diameter in twins(data):
-        (folder / f"{test}_raw.txt").symlink_to((data / f"{test}_raw.txt").resolve())
-        write_specimen(folder / f"{test}_raw.toml", height, diameter)

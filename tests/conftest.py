@@ -34,7 +34,8 @@ EXPERIMENTS = ROOT / "experiments"
 DATA = Path(os.environ.get("FOAMFIT_DATA", ROOT.parent / "shared" / "data"))
 
 # Records made by the studies, which share no code with foamfit.
-STUDIES = ("recovery", "law_error", "real_foams", "stability", "microscale", "paper_claims", "")
+STUDIES = ("recovery", "law_error", "real_foams", "stability", "microscale", "paper_claims")
+STUDIES += ("other_laws", "")
 sys.path += [str(EXPERIMENTS / name) for name in STUDIES]
 gc.disable()  # imported modules and collected tests live until exit
 HEIGHT, AREA = 1.19e-3, 1.9635e-5
@@ -122,9 +123,11 @@ def run_refused(*args: object) -> str:
     return told.stderr
 
 
-def write_csv(path: Path, head: str, *columns: Any, fmt: str = "%.9g") -> Path:
-    """Write columns under a head."""
+def write_csv(path: Path, head: str, *columns: Any, fmt: str = "%.9g", toml: str = "") -> Path:
+    """Write columns under a head, and a TOML beside them if there is one."""
     np.savetxt(path, np.column_stack(columns), fmt, ",", header=head, comments="")
+    if toml:
+        path.with_suffix(".toml").write_text(toml, encoding="utf-8")
     return path
 
 
@@ -133,12 +136,10 @@ def write_measurement(path: Path, test: Measurement, more: str = "") -> Path:
     columns = {"time (s)": test.time, "stress (Pa)": test.stress}
     columns = {name: values for name, values in columns.items() if values is not None}
     head = ",".join([*columns, "displacement (m)"])
-    write_csv(path, head, *columns.values(), test.displacement)
     one, by = test.specimen, test.striker
     toml = f'[specimen]\nheight = "{one.height} m"\narea = "{one.area} m^2"\n'
     toml += f'[striker]\nmass = "{by.mass} kg"\nvelocity = "{by.velocity} m/s"\n' if by else ""
-    path.with_suffix(".toml").write_text(toml + more)
-    return path
+    return write_csv(path, head, *columns.values(), test.displacement, toml=toml + more)
 
 
 def correlated(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:

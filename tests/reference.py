@@ -1,11 +1,10 @@
 """An independent law of the bistable and the linear spring, and the energies of an impact.
 
-Nothing here uses the package. Springs and chains are any objects with the attributes of `Bistable`,
-`Linear` and `Chain` below. Derived points are roots of the branch functions, found by bracketing.
+Nothing here uses the package: of springs and chains only the parameters are read. Derived points
+are roots of the branch functions, found by bracketing.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -17,40 +16,6 @@ from scipy.optimize import brentq
 Array = NDArray[np.float64]
 
 _QUADRATURE = np.polynomial.legendre.leggauss(24)
-
-
-@dataclass(frozen=True)
-class Bistable:
-    k0: float
-    kc: float
-    dsigma: float
-    eps_a: float
-    eps_c: float
-    kh_plus: float
-    kh_minus: float
-    eta: float = 0.0
-
-
-@dataclass(frozen=True)
-class Linear:
-    k0: float
-    eta: float = 0.0
-    unilateral: bool = False
-
-
-@dataclass(frozen=True)
-class Chain:
-    springs: tuple[Bistable | Linear, ...]
-    heights: tuple[float, ...]
-    area: float
-    masses: tuple[float, ...] | None = None
-    site_damping: float = 0.0
-
-
-@dataclass(frozen=True)
-class Impact:
-    mass: float
-    velocity: float
 
 
 def root(function: Callable[[float], float], low: float, high: float) -> float:
@@ -263,8 +228,7 @@ def energy_balance(
     loops, `stored` the rest. During contact, `brought` = `kinetic` + `work`.
     """
     w, v = np.atleast_2d(displacement), np.atleast_2d(velocity)
-    n = len(chain.springs)
-    mass = np.zeros(n) if chain.masses is None else np.array(chain.masses, float)
+    mass = np.array(chain.masses, float)
     mass[-1] += drive.mass
     strain = np.diff(w, axis=0, prepend=0.0) / np.array(chain.heights)[:, None]
     work, lost = np.zeros(w.shape[1]), np.zeros(w.shape[1])

@@ -13,12 +13,12 @@ import pytest
 from scipy.signal import lfilter
 
 import foamfit as ff
+import records
 from conftest import (
     needs_data,
     run,
     run_refused,
     small_pictures,
-    specimen_toml,
     synthetic_impact,
     synthetic_loop,
     write_measurement,
@@ -304,8 +304,7 @@ def test_where_no_model_reaches_the_noise_prediction_decides(monkeypatch, tmp_pa
 
 @needs_data
 def test_a_running_shoe_foam_ends_below_one_percent(thin_foams, tmp_path, monkeypatch):
-    toml = specimen_toml(tmp_path, 10.53, 7.63)
-    test = ff.read_test(thin_foams / "shoe-foam" / "turbo-comp-1_cycle1.csv", toml)
+    test = ff.read_test(records.place("turbo-comp-1", tmp_path, thin_foams))
     few = (*groups("bistable", "microscale"), *groups("microscale", relaxation=1))
     monkeypatch.setattr(auto, "LADDER", few)  # saves time
     result = ff.fit(test, model="auto", starts=2, intervals="local")

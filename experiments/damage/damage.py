@@ -20,6 +20,7 @@ import foamfit as ff
 from foamfit.text import significant
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import records
 import studies
 
 HERE = Path(__file__).parent
@@ -27,7 +28,7 @@ MODEL = {"model": "microscale", "relaxation": 1}
 NAMES = tuple(f"s1_{name}" for name in (*studies.MICROSCALE, "g1", "tau1"))
 SHOWN = ("start_strain", "dissipated_energy", "misfit_stress_strain", *NAMES)
 SHARES = ("start_strain", "misfit_stress_strain")
-LATTICES, LATTICE_CYCLES = ("tpu87-20", "tpu87-35", "tpu87-50"), (1, 2, 10, 100, 1000)
+LATTICE_CYCLES = (1, 2, 10, 100, 1000)
 
 
 def is_pressure(column: str) -> bool:
@@ -38,13 +39,11 @@ def is_pressure(column: str) -> bool:
 # ------------------------------------------------------------------------------- the twins
 
 
-def fit_twins(data: Path, toml: Path) -> pd.DataFrame:
+def fit_twins(folder: Path) -> pd.DataFrame:
     """Return one row per specimen and cycle."""
     rows = []
-    for name, height, diameter in studies.twins(data / "shoe-foam-twins"):
-        studies.write_specimen(toml, height, diameter)
-        path = data / "shoe-foam-twins" / f"{name}_raw.txt"
-        found = ff.fit_cycles(path, toml, intervals="local", **MODEL)
+    for name in records.HEELS:
+        found = ff.fit_cycles(records.place(name, folder), intervals="local", **MODEL)
         rows.append(found.by_cycle.reset_index().assign(specimen=name))
         print(name, len(found.results), "cycles", file=sys.stderr)
     return specimen_first(rows)
@@ -111,15 +110,13 @@ def twin_changes(table: pd.DataFrame) -> str:
 # ------------------------------------------------------------------------------- the lattices
 
 
-def fit_lattices(data: Path, toml: Path) -> tuple[pd.DataFrame, dict[str, ff.CycleFits]]:
-    studies.write_specimen(toml, "12 mm", "20 mm", studies.LATTICE)
+def fit_lattices(folder: Path) -> tuple[pd.DataFrame, dict[str, ff.CycleFits]]:
     found = {
         name: ff.fit_cycles(
-            data / "lattice-cycles" / f"{name}_raw.csv", toml, cycles=LATTICE_CYCLES,
-            intervals="local", **MODEL,
+            records.place(name, folder), cycles=LATTICE_CYCLES, intervals="local", **MODEL
         )
-        for name in LATTICES
-    }  # fmt: skip
+        for name in records.LATTICES
+    }
     tables = [one.by_cycle.reset_index().assign(specimen=name) for name, one in found.items()]
     return specimen_first(tables), found
 
@@ -161,11 +158,10 @@ def draw_lattices(found: dict[str, ff.CycleFits]) -> None:
 
 def main() -> None:
     studies.arguments(__doc__).parse_args()
-    data = studies.measurements("shoe-foam-twins", "lattice-cycles")
+    studies.measurements("shoe-foam-twins", "lattice-cycles")
     with tempfile.TemporaryDirectory() as folder:
-        toml = Path(folder) / "specimen.toml"
-        lattices, found = fit_lattices(data, toml)
-        twins = fit_twins(data, toml)
+        lattices, found = fit_lattices(Path(folder))
+        twins = fit_twins(Path(folder))
     studies.write_csv(twins, HERE / "twins.csv", 6)
     studies.write_csv(lattices, HERE / "lattice.csv", 6)
     draw_lattices(found)

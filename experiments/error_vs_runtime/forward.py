@@ -2,13 +2,10 @@
 
 Method and answer: README.md. All solvers of a scene alternate in one process, and processor time is
 measured, so that a busy machine affects all of them equally; ratios compare medians of one run. A
-table and a figure per scene and summary.csv go to `forward/`. With `--series` foamfit and SciPy are
-measured in a checkout of the last commit whose solver expands Taylor series; series.csv keeps the
-points, which are drawn after scaling by the times of SciPy in both runs.
+table and a figure per scene and summary.csv go to `forward/`.
 
     python experiments/error_vs_runtime/forward.py                      # all: about 5 minutes
     python experiments/error_vs_runtime/forward.py one_spring_impact    # some scenes, no page
-    PYTHONPATH=CHECKOUT/src python experiments/error_vs_runtime/forward.py --series
 """
 
 from __future__ import annotations
@@ -39,8 +36,6 @@ import studies
 from studies import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
 
 HERE = Path(__file__).parent
-SERIES, COMMIT = HERE / "forward" / "series.csv", "c076402b"
-BEFORE = "series: "  # of the names of its solvers
 WANTED = 2e-6  # the error at which solvers are compared
 ROUNDS = 40
 SHORTEST = 2e-3  # s; shorter runs are timed in groups
@@ -52,8 +47,6 @@ TIMES = ["median (s)", "lower quartile (s)", "upper quartile (s)"]
 SOLVERS: dict[str, dict[str, Any]] = {
     PUBLIC: {"color": BLUE, "marker": "o", "linewidth": 1.6},
     KERNEL: {"color": VERMILION, "marker": "D", "linewidth": 1.6},
-    BEFORE + PUBLIC: {"color": BLUE, "marker": "o", "linestyle": ":", "mfc": "none"},
-    BEFORE + KERNEL: {"color": VERMILION, "marker": "D", "linestyle": ":", "mfc": "none"},
     HEYOKA: {"color": GREEN, "marker": "*", "markersize": 6},
     f"{SCIPY} DOP853": {"color": BLACK, "marker": "s"},
     f"{SCIPY} LSODA": {"color": SKY, "marker": "^"},
@@ -133,22 +126,6 @@ def take_turns(timed: list[Timed], budget: float) -> None:
     gc.enable()
 
 
-def with_series(tables: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
-    """Add the stored points of the series solver, scaled by the times of SciPy in both runs."""
-    stored = pd.read_csv(SERIES)
-    now = pd.concat([table.assign(scene=name) for name, table in tables.items()])
-    both = now.merge(stored, on=["scene", "solver", "setting"], suffixes=("", " then"))
-    both = both[both["solver"].str.startswith(SCIPY)]
-    factor = float((both[TIMES[0]] / both[f"{TIMES[0]} then"]).median()) if len(both) else 1.0
-    stored[TIMES] *= factor
-    stored = stored[~stored["solver"].str.startswith(SCIPY)]
-    stored["solver"] = BEFORE + stored["solver"]
-    return {
-        name: pd.concat([table, stored[stored["scene"] == name].drop(columns="scene")])
-        for name, table in tables.items()
-    }
-
-
 # ---------------------------------------------------------------- figures and tables
 
 
@@ -180,10 +157,7 @@ def draw_scene(table: pd.DataFrame, title: str, path: Path) -> None:
 def compare(scene: Scene, table: pd.DataFrame) -> dict[str, object]:
     """Return one row of the summary: the fastest setting of each solver with an error < WANTED."""
     reached, row = table[table["error"] < WANTED], dict[str, object](scene=scene.title)
-    columns = {
-        "simulate": PUBLIC, "kernel": KERNEL, "series: simulate": BEFORE + PUBLIC,
-        "series: kernel": BEFORE + KERNEL, "SciPy": SCIPY, "heyoka": HEYOKA,
-    }  # fmt: skip
+    columns = {"simulate": PUBLIC, "kernel": KERNEL, "SciPy": SCIPY, "heyoka": HEYOKA}
     for column, family in columns.items():
         part = reached[reached["solver"].str.startswith(family)]
         row[f"{column} (s)"] = part[TIMES[0]].min()
@@ -196,23 +170,15 @@ def main() -> None:
     """Measure and draw the scenes; write the page if all were asked for."""
     parser = studies.arguments(__doc__, HERE, budget=(6.0, "seconds of turns a scene"))
     parser.add_argument("scenes", nargs="*", help="names; left out = all, and the page")
-    parser.add_argument("--series", action="store_true", help="write series.csv alone")
     options = parser.parse_args()
     folder, wanted = options.out / "forward", rivals.scenes()
     if options.scenes:
         wanted = [scene for scene in wanted if scene.name in options.scenes]
     folder.mkdir(parents=True, exist_ok=True)
-    tables = dict[str, pd.DataFrame]()
+    rows, figures = [], []
     for scene in wanted:
-        tables[scene.name] = measure(scene, options.budget)
         print(scene.name, file=sys.stderr)
-    if options.series:
-        rows = pd.concat([table.assign(scene=name) for name, table in tables.items()])
-        studies.write_csv(rows[["scene", *rows.columns.drop("scene")]], SERIES)
-        return
-    tables, rows, figures = with_series(tables), [], []
-    for scene in wanted:
-        table = tables[scene.name]
+        table = measure(scene, options.budget)
         studies.write_csv(table, folder / f"{scene.name}.csv")
         draw_scene(table, scene.title, folder / f"{scene.name}.png")
         figures.append(f"![Error against run time: {scene.title}](forward/{scene.name}.png)")
@@ -222,13 +188,11 @@ def main() -> None:
         return
     summary = pd.DataFrame(rows)
     studies.write_csv(summary, folder / "summary.csv")
-    faster = summary["kernel (s)"] / summary["series: kernel (s)"]
     optional = [HEYOKA] if find_spec(HEYOKA) else []
     studies.write_page(
         HERE, options.out, wanted=f"{WANTED:g}", table=studies.shown(summary),
-        faster=(faster.min(), faster.max()),
         where=studies.circumstances("NumPy", "SciPy", "numba", "foamfit", *optional),
-        figures="\n\n".join(figures), commit=COMMIT,
+        figures="\n\n".join(figures),
     )  # fmt: skip
 
 

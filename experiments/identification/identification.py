@@ -45,6 +45,7 @@ from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import box_starts
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import records
 import studies
 
 HERE = Path(__file__).parent
@@ -84,22 +85,25 @@ STYLES = {
 
 @dataclass(frozen=True)
 class Case:
-    """An identification problem: test file, model and drive."""
+    """An identification problem: record, model and drive."""
 
     title: str
-    file: str  # below experiments/, or below FOAMFIT_DATA if `specimen` is given
+    record: str  # a file below experiments/, or a measurement of others
     model: str
     drive: str
-    specimen: tuple[str, str] | None = None  # height and diameter
+
+    @property
+    def by_others(self) -> bool:
+        """Whether the record is not part of this repository."""
+        return not self.record.endswith(".csv")
 
     def problem(self) -> Problem:
         """Read the test and set up the problem, as `foamfit.fit` does."""
-        if self.specimen is None:
-            test = ff.read_test(HERE.parent / self.file)
-        else:
+        if self.by_others:
             with tempfile.TemporaryDirectory() as folder:
-                toml = studies.write_specimen(Path(folder) / "specimen.toml", *self.specimen, "")
-                test = ff.read_test(studies.measurements() / self.file, toml)
+                test = ff.read_test(records.place(self.record, Path(folder)))
+        else:
+            test = ff.read_test(HERE.parent / self.record)
         return make_problem(test, self.model, self.drive, None, None, False)
 
 
@@ -118,8 +122,7 @@ CASES = {
     ),
     "shoe-foam": Case(
         "One spring, shoe foam (measurement: arXiv:2602.12694)",
-        "shoe-foam/turbo-comp-1_cycle1.csv", "bistable", "displacement",
-        ("10.53 mm", "7.63 mm"),
+        "turbo-comp-1", "bistable", "displacement",
     ),
 }  # fmt: skip
 
@@ -292,7 +295,7 @@ def run_all(options: argparse.Namespace) -> tuple[pd.DataFrame, dict[str, Any]]:
     known, rows = dict[str, float](), list[tuple[Any, ...]]()
     for key in options.problems:
         case = CASES[key]
-        if case.specimen is not None and not os.environ.get("FOAMFIT_DATA"):
+        if case.by_others and not os.environ.get("FOAMFIT_DATA"):
             print(f"{key}: left out, FOAMFIT_DATA names no folder of measurements")
             continue
         problem = case.problem()

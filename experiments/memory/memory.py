@@ -24,8 +24,10 @@ from foamfit.data.noise import noise_level
 from foamfit.results import Fit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import records
 import studies
-from real_foams import SHOE_FOAM, SOURCE, first_cycles, varied
+from real_foams import varied
+from records import HEELS, SOURCE
 
 HERE = Path(__file__).parent
 TABLE, PARAMETERS, BACK = (HERE / f"{name}.csv" for name in ("memory", "parameters", "ways_back"))
@@ -42,15 +44,6 @@ FORCES = (
 )  # fmt: skip
 LOADED, WHOLE = 0.05, 0.35  # minimum shares of the largest force and of the motion
 MEMORY: dict[str, Any] = {"model": "microscale", "stiffening": True, "mullins": True}
-
-
-def histories(data: Path, folder: Path) -> Iterator[tuple[str, Path, Path]]:
-    """Yield name, file and TOML of each specimen with several cycles in a file."""
-    own = [("turbo-comp-1", *SHOE_FOAM["turbo-comp-1"], data / "shoe-foam")]
-    twins = [(*one, data / "shoe-foam-twins") for one in studies.twins(data / "shoe-foam-twins")]
-    for name, height, diameter, place in (*own, *twins):
-        toml = studies.write_specimen(folder / f"{name}-cycles.toml", height, diameter)
-        yield name, place / f"{name}_raw.txt", toml
 
 
 def misfits(test: ff.Measurement, result: Fit) -> dict[int, float]:
@@ -99,7 +92,7 @@ def fitted(test: ff.Measurement, **more: Any) -> tuple[Fit, float]:
     return ff.fit(test, **MEMORY, **more), time.process_time() - began
 
 
-def study(data: Path) -> None:
+def study() -> None:
     """Fit and predict; both tables are written row by row."""
     rows, values = list[dict[str, Any]](), list[dict[str, Any]]()
 
@@ -116,17 +109,18 @@ def study(data: Path) -> None:
         studies.write_csv(values, PARAMETERS)
         print(test, what, *(f"{100.0 * row['misfit']:.2f} %" for row in more), flush=True)
 
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        for test in first_cycles(data, folder):
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        for test in records.first_cycles(folder):
             result, seconds = fitted(test, relaxation=1)
             miss = misfits(test, result)[test.cycle]
             row = {"cycle": 1, "misfit": miss, "inside": np.nan, "seconds": seconds}
             add(test.name, FIRST, [row], result)
-        for specimen, file, toml in histories(data, folder):
-            test = ff.read_test(file, toml, cycles=(1, 3))
+        for name in ("turbo-comp-1 cycles", *HEELS):
+            file, specimen = records.place(name, folder), name.removesuffix(" cycles")
+            test = ff.read_test(file, cycles=(1, 3))
             result, seconds = fitted(test, relaxation=2)
-            later = ff.predict(result, ff.read_test(file, toml, cycles=(1, 5)))
+            later = ff.predict(result, ff.read_test(file, cycles=(1, 5)))
             whole = {"cycle": "1-3", "misfit": result.misfit["stress_strain"], "seconds": seconds}
             each = [{"cycle": n, "misfit": m} for n, m in misfits(test, result).items()]
             add(specimen, HISTORY, [whole, *each], result)
@@ -234,7 +228,7 @@ def main() -> None:
     if not parser.parse_args().page:
         data = studies.measurements("shoe-foam", "shoe-foam-twins")
         studies.write_csv(turned_back(data), BACK)
-        study(data)
+        study()
     table, values = pd.read_csv(TABLE), pd.read_csv(PARAMETERS)
     studies.write_page(
         HERE, source=SOURCE, summary=summary(table), specimens=per_specimen(table),

@@ -142,7 +142,7 @@ def sampled(rng: np.random.Generator, rows: int) -> np.ndarray:
     return t
 
 
-def matched(motion: Motion, turns: np.ndarray, t: np.ndarray) -> list[tuple[int, int]]:
+def matched(motion: Motion, turns: np.ndarray) -> list[tuple[int, int]]:
     """Pair true and found turning points of one kind, each closer than the next true one."""
     ends = np.concatenate([[0.0], motion.turns, [1.0]])
     pairs, taken = [], set()
@@ -172,7 +172,7 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterato
     near = np.any(np.abs(t[:, None] - motion.turns) < NEAR, axis=1)
     for a, b in motion.holds:
         near |= (t > a - NEAR) & (t < b + NEAR)
-    pairs = matched(motion, found.turns, t)
+    pairs = matched(motion, found.turns)
     fine = np.linspace(0.0, 1.0, 7 * rows)
     steps = np.diff(found.at(np.union1d(fine, found.turns)))
     stretch = np.searchsorted(found.turns, np.union1d(fine, found.turns)[:-1], side="right")
@@ -189,22 +189,22 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterato
         "invented": len(found.turns) - len(pairs), "back": back,
         "modes": found.modes(t[:1]).shape[1],
     }  # fmt: skip
-    sizes = np.abs(np.diff(motion.at(np.concatenate([[0.0], motion.turns, [1.0]]))))
-    for i, at in enumerate(motion.turns):
+    ends = np.concatenate([[0.0], motion.turns, [1.0]])
+    heights = motion.at(ends)
+    sizes, lasts = np.abs(np.diff(heights)), np.diff(ends)
+    for i, (at, height) in enumerate(zip(motion.turns, heights[1:-1], strict=True)):
         j = dict(pairs).get(i)
-        size = min(sizes[i], sizes[i + 1])
-        turn = row | {"what": "turn", "size": size / noise, "found": j is not None}
-        ends = np.concatenate([[0.0], motion.turns, [1.0]])
-        turn |= {"samples": rows * min(np.diff(ends)[i : i + 2])}
+        turn = row | {
+            "what": "turn", "size": min(sizes[i : i + 2]) / noise, "found": j is not None,
+            "samples": rows * min(lasts[i : i + 2]),
+        }  # fmt: skip
         if j is not None:
             here = found.turns[j : j + 1]
-            sign = 1.0 if motion.at(np.array(at)) > motion.at(np.array(ends[i])) else -1.0
-            error = float(found.at(here)[0] - motion.at(np.array(at)))
-            turn |= {"height": sign * error / noise,
-                     "height_z": sign * error / np.linalg.norm(found.modes(here))}  # fmt: skip
+            over = float(np.sign(height - heights[i]) * (found.at(here)[0] - height))
+            turn["height"] = over / noise
+            turn["height_z"] = over / np.linalg.norm(found.modes(here))
             if not motion.holds:
-                late = float(here[0] - at)
-                turn |= {"late": late * rows}
+                turn["late"] = rows * float(here[0] - at)
         yield turn
 
 

@@ -12,6 +12,7 @@ import importlib
 import sys
 import tempfile
 import time
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,8 +24,8 @@ from foamfit.springs import laws
 from foamfit.springs.parameters import NUISANCE
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import records
 import studies
-from real_foams import SHOE_FOAM
 
 HERE = Path(__file__).parent
 sys.path.append(str(HERE.parents[1] / "notebooks"))  # of bouc_wen.py
@@ -72,38 +73,20 @@ TESTS = (
     (MYCELIUM, "outplane-4s-1", "outplane-4s-2"),
     (LATTICE, "tpu87-20 cycle 10", "tpu87-20 cycle 100"),
     (LATTICE, "tpu87-50 cycle 10", "tpu87-50 cycle 100"),
-    (IMPACT, "test_1_impact", "test_3_impact"),
+    (IMPACT, "cartilage 1", "cartilage 3"),
 )
-SHOWN = ("turbo-comp-1", "outplane-4s-1", "tpu87-20 cycle 10", "test_1_impact")
-STRIKER = '[striker]\nmass = "358.39 g"\nvelocity = "{velocity} m/s"\n'
-VELOCITY = {"test_1_impact": 0.785, "test_3_impact": 0.905}  # m/s
+SHOWN = ("turbo-comp-1", "outplane-4s-1", "tpu87-20 cycle 10", "cartilage 1")
 
 
 # ------------------------------------------------------------------------------- the tests
 
 
-def read(group: str, name: str, data: Path, folder: Path) -> ff.Measurement:
+def read(name: str, folder: Path) -> ff.Measurement:
     """Read a test like a user, and thin it."""
-    toml, cycle = folder / "specimen.toml", None
-    if name in SHOE_FOAM:
-        path = data / "shoe-foam" / f"{name}_cycle1.csv"
-        studies.write_specimen(toml, *SHOE_FOAM[name], "")
-    elif group == FOAM:
-        sizes = {one: size for one, *size in studies.twins(data / "shoe-foam-twins")}
-        path = data / "shoe-foam-twins" / f"{name}_raw.txt"
-        studies.write_specimen(toml, *sizes[name])
-    elif group == MYCELIUM:
-        path = data / "mycelium-rates" / f"{name}_raw.txt"
-        toml = studies.mycelium(path, folder)
-    elif group == LATTICE:
-        stem, _, number = name.split()
-        path, cycle = data / "lattice-cycles" / f"{stem}_raw.csv", int(number)
-        studies.write_specimen(toml, "12 mm", "20 mm", studies.LATTICE)
-    else:
-        path = data / "cartilage-impact" / f"{name}.csv"
-        studies.write_specimen(toml, "0.563 mm", "8.5 mm", "")
-        toml.write_text(toml.read_text() + STRIKER.format(velocity=VELOCITY[name]))
-    return thinned(ff.read_test(path, toml, cycle=cycle), folder / f"{name}.csv")
+    record, _, cycle = name.partition(" cycle ")
+    path = records.place(record, folder)
+    test = ff.read_test(path, cycle=int(cycle) if cycle else None)
+    return thinned(test, folder / f"{name}.csv")
 
 
 def thinned(test: ff.Measurement, path: Path) -> ff.Measurement:
@@ -121,12 +104,12 @@ def thinned(test: ff.Measurement, path: Path) -> ff.Measurement:
 # ------------------------------------------------------------------------------- the fits
 
 
-def fit_all(case: tuple[str, str, str], data: Path, starts: int) -> list[dict[str, Any]]:
+def fit_all(case: tuple[str, str, str], starts: int) -> list[dict[str, Any]]:
     """Fit one test by every law and predict the unseen test; return rows with curves."""
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         folder, (group, name, other) = Path(temporary), case
-        test, held_out = (read(group, one, data, folder) for one in (name, other))
+        test, held_out = (read(one, folder) for one in (name, other))
         for law in LAWS:
             if law.file and not laws.is_registered(law.model):
                 ff.register(importlib.import_module(law.file).LAW)
@@ -166,29 +149,14 @@ def predicted(result: Any, test: ff.Measurement) -> dict[str, float]:
 
 def law_table(table: pd.DataFrame) -> str:
     """Return the table of the README: for each law, misfit and predicted misfit by group."""
-    rows = []
-    groups = list(dict.fromkeys(group for group, *_ in TESTS))
-    fitted = {group: set(table[table["group"] == group]["test"]) or {""} for group in groups}
-    best = {
-        (group, one): table[table["group"] == group].groupby("law")[one].mean().min()
-        for group in groups
-        for one in MEASURES
-    }
-    for law in LAWS:
-        own = table[table["law"] == law.name]
-        if own.empty:
-            continue
-        cells = []
-        for group in groups:
-            part = own[own["group"] == group]
-            if len(part) < len(fitted[group]):  # a study that was interrupted
-                cells.append("–")
-                continue
-            both = {one: part[one].mean() for one in MEASURES}
-            bold = {one: "**" * bool(v == best[group, one]) for one, v in both.items()}
-            cells.append(" / ".join(f"{bold[n]}{100.0 * v:.2f}{bold[n]}" for n, v in both.items()))
+    groups, rows = table["group"].unique(), []
+    means = table.pivot_table(index="law", columns="group", values=list(MEASURES), sort=False)
+    text = (100.0 * means).map("{:.2f}".format)
+    text = text.where(means != means.min(), "**" + text + "**")
+    for law, own in table.groupby("law", sort=False):
+        cells = (" / ".join(text.loc[law, (one, group)] for one in MEASURES) for group in groups)
         rows.append([
-            law.name, own["parameters"].iloc[0], *cells,
+            law, own["parameters"].iloc[0], *cells,
             f"{own['determined'].mean():.1f}", f"{own['seconds'].median():.1f} s",
         ])  # fmt: skip
     return studies.markdown(["law", "parameters", *groups, "determined", "run time"], rows)
@@ -201,17 +169,14 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     tests = [name for name in SHOWN if any(test == name for test, _ in found)]
     with studies.sheet(path, 1.55 * len(names), 1.5 * len(tests) + 0.5) as figure:
         axes = figure.subplots(len(tests), len(names), sharey="row", sharex="row", squeeze=False)
-        for (name, line), column in ((one, k) for one in zip(tests, axes, strict=True)
-                                     for k in range(len(names))):  # fmt: skip
-            row, ax = found.get((name, names[column])), line[column]
+        for (i, name), (column, law) in product(enumerate(tests), enumerate(names)):
+            row, ax = found[name, law], axes[i, column]
             if name == tests[0]:
-                title = names[column].replace(": ", ":\n").replace(", ", ",\n")
+                title = law.replace(": ", ":\n").replace(", ", ",\n")
                 title = title.replace(" on ", "\non ").replace(" beside ", "\nbeside ")
                 ax.set_title(title, fontsize=6.5)
             if name == tests[-1]:
                 ax.set_xlabel("strain (–)")
-            if row is None:  # a study that was interrupted
-                continue
             strain, measured, fitted = row["curves"]
             factor, unit = (1e6, "MPa") if measured.max() > 1e6 else (1e3, "kPa")
             ax.plot(strain, measured / factor, color="0.6", lw=1.6)
@@ -221,7 +186,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
                 fontsize=7,
             )  # fmt: skip
             if column == 0:
-                ax.set_ylabel(f"{name.removesuffix('_impact')}\nstress ({unit})", fontsize=7)
+                ax.set_ylabel(f"{name}\nstress ({unit})", fontsize=7)
         figure.suptitle(
             "Measured (grey; shoe foam arXiv:2602.12694, mycelium LivingMatterLab/CANN, lattice "
             "mev43/FYP-Cyclic-Compression, cartilage JoVE 64450), fitted (red), misfit",
@@ -247,12 +212,12 @@ def main() -> None:
 
 def fit_tests(given: argparse.Namespace) -> None:
     """Fit all tests; write the table and the figure."""
-    data = studies.measurements(
+    studies.measurements(
         "shoe-foam", "shoe-foam-twins", "mycelium-rates", "lattice-cycles", "cartilage-impact"
     )
     cases = [case for case in TESTS if given.only in case[1]]
     rows = list[dict[str, Any]]()
-    jobs = [(case, data, given.starts) for case in cases]
+    jobs = [(case, given.starts) for case in cases]
     for more in studies.in_order(fit_all, jobs, given.jobs):
         rows += more  # an interrupted study keeps its rows
         table = pd.DataFrame(rows).drop(columns="curves")

@@ -8,7 +8,6 @@ Method and answer: README.md. Written: real.csv; plan.py then writes the page.
 from __future__ import annotations
 
 import math
-import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ import pandas as pd
 import foamfit as ff
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import records
 import studies
 
 HERE = Path(__file__).parent
@@ -39,12 +39,9 @@ def obtained(foam: str, name: str, what: str, found: Any) -> Row:
     return row(foam, name, what, half, open_, one.state)
 
 
-def relaxation(data: Path, folder: Path) -> Iterator[Row]:
+def relaxation(folder: Path) -> Iterator[Row]:
     """Yield rows on the relaxation of the mycelium."""
-    paths = {rate: folder / f"outplane-{rate}-1_raw.txt" for rate in RATES}
-    for path in paths.values():
-        shutil.copy(data / path.name, path)
-        studies.mycelium(path, folder)
+    paths = {rate: records.place(f"outplane-{rate}-1", folder) for rate in RATES}
     rig = folder / "rig.toml"
     rig.write_text('[machine]\nrate = "0.025 to 1 1/s"\nstrain = "0.5"\ncycles = 1\n')
     first = ff.fit(ff.read_test(paths["2s"]), model="microscale", relaxation=1)
@@ -72,19 +69,18 @@ def relaxation(data: Path, folder: Path) -> Iterator[Row]:
                 yield obtained("mycelium", name, what, found)
 
 
-def cycles(data: Path, folder: Path) -> Iterator[Row]:
+def cycles(folder: Path) -> Iterator[Row]:
     """Yield rows on the cycles of a shoe foam."""
-    sizes = {name: size for name, *size in studies.twins(data)}
-    toml = studies.write_specimen(folder / "heel.toml", *sizes[HEEL])
-    path, law = data / f"{HEEL}_raw.txt", {"model": "microscale", "relaxation": 1, "mullins": True}
-    first = ff.fit(ff.read_test(path, toml), **law)
+    path = records.place(HEEL, folder)
+    law = {"model": "microscale", "relaxation": 1, "mullins": True}
+    first = ff.fit(ff.read_test(path), **law)
     again = next(one.candidate for one in ff.plan(first).outcomes if one.candidate.repeat)
     rig = folder / "heel-rig.toml"
     rig.write_text(f'[machine]\nrate = "{again.rate} 1/s"\nstrain = "{again.strain}"\ncycles = 5\n')
     plan = ff.plan(first, rig=rig)
     print(plan)
     five = next(one for one in plan.outcomes if one.candidate.cycles == 5)
-    later = ff.fit(ff.read_test(path, toml, cycles=(1, 5)), **law)
+    later = ff.fit(ff.read_test(path, cycles=(1, 5)), **law)
     for name, found in five.expected.items():
         yield obtained("shoe foam", name, "cycle 1", first)
         yield row(
@@ -102,11 +98,10 @@ def row(foam: str, name: str, what: str, half: float, open_: float, state: str) 
 def main() -> None:
     """Run the study."""
     out = studies.arguments(__doc__, HERE).parse_args().out
-    data = studies.measurements("mycelium-rates", "shoe-foam-twins")
+    studies.measurements("mycelium-rates", "shoe-foam-twins")
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        rows = [*relaxation(data / "mycelium-rates", folder),
-                *cycles(data / "shoe-foam-twins", folder)]  # fmt: skip
+        rows = [*relaxation(folder), *cycles(folder)]
     studies.write_csv(rows, out / "real.csv", 3)
     print(pd.DataFrame(rows).to_string(index=False))
 

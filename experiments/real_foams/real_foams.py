@@ -26,16 +26,12 @@ from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import records
 import studies
+from records import SOURCE
 from studies import BLUE, GREY, VERMILION
 
 HERE = Path(__file__).parent
-SHOE_FOAM = {  # height and diameter of specimens whose first cycle is a file of its own
-    "turbo-comp-1": ("10.53 mm", "7.63 mm"),
-    "turbo-comp-2": ("9.66 mm", "7.68 mm"),
-    "leap-comp-2": ("10.65 mm", "7.62 mm"),
-    "leap-comp-3": ("10.68 mm", "7.80 mm"),
-}
 # Name of the law: model, relaxation terms, descents (None: the default of a fit).
 LAWS: dict[str, tuple[str, int, int | None]] = {
     "bistable": ("bistable", 0, None),
@@ -45,21 +41,6 @@ LAWS: dict[str, tuple[str, int, int | None]] = {
 }
 BEST, PLAIN = "microscale, relaxation", "bistable"
 SHOWN = "new-heel-comp-1"  # in the picture
-SOURCE = "arXiv:2602.12694 (LivingMatterLab/CANN)"
-
-
-def first_cycles(data: Path, folder: Path, foams: tuple[str, ...] = ()) -> Iterator[ff.Measurement]:
-    """Yield the first cycle of every specimen, or of the specimens of some foams."""
-    own = [(name, *size, f"shoe-foam/{name}_cycle1.csv", "") for name, size in SHOE_FOAM.items()]
-    twins = [
-        (*one, f"shoe-foam-twins/{one[0]}_raw.txt", studies.GAP)
-        for one in studies.twins(data / "shoe-foam-twins")
-    ]
-    for name, height, diameter, file, columns in (*own, *twins):
-        if not foams or name.rpartition("-")[0] in foams:
-            toml = studies.write_specimen(folder / f"{name}.toml", height, diameter, columns)
-            toml.write_text(f'name = "{name}"\n{toml.read_text()}')
-            yield ff.read_test(data / file, toml)
 
 
 def varied(result: Fit) -> dict[str, ParameterEstimate]:
@@ -168,11 +149,11 @@ def _write_values(side: Axes, result: Fit) -> None:
 def main() -> None:
     """Fit every specimen by every law; write page, table and figure."""
     studies.arguments(__doc__).parse_args()
-    data = studies.measurements("shoe-foam", "shoe-foam-twins")
+    studies.measurements("shoe-foam", "shoe-foam-twins")
     ff.fit(ff.read_test(HERE.parent / "foam-1" / "model-1-2.0mps-reconstruction.csv"))  # compiles
     rows, shown = list[dict[str, Any]](), dict[str, Fit]()
     with tempfile.TemporaryDirectory() as folder:
-        tests = list(first_cycles(data, Path(folder)))
+        tests = list(records.first_cycles(Path(folder)))
         for test in tests:
             for law, (model, relaxation, starts) in LAWS.items():
                 began = time.process_time()  # the machine may be shared

@@ -22,8 +22,8 @@ from scipy.optimize import least_squares
 import foamfit as ff
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import records
 import studies
-from real_foams import first_cycles
 
 HERE = Path(__file__).parent
 Array = np.ndarray
@@ -31,68 +31,28 @@ Values = dict[str, float]
 MODELS = {"bistable": 0, "microscale": 1}  # and the number of relaxation terms
 STARTS = 25
 SECONDS = 60.0
-CARTILAGE = """\
-[specimen]
-height = "0.563 mm"
-diameter = "8.5 mm"
-[striker]
-mass = "358.39 g"
-velocity = "0.9 m/s"
-"""
-LATTICE = """\
-[specimen]
-height = "20 mm"
-area = "400 mm^2"
-[striker]
-mass = "1 kg"
-velocity = "1.0 m/s"
-[columns]
-time = { column = "time_s", unit = "s" }
-displacement = { column = "displacement_m", unit = "m" }
-force = { column = "specific_force_N_per_kg", unit = "N" }
-"""
-ALUMINIUM = """\
-[specimen]
-height = "15 mm"
-diameter = "30 mm"
-[columns]
-strain = { column = "reference_engineering_strain" }
-stress = { column = "reference_engineering_stress_MPa", unit = "MPa" }
-"""
-SHOE = '[specimen]\nheight = "{}"\ndiameter = "{}"\n'
 
 
 @dataclass(frozen=True)
 class Real:
-    """A record: file, TOML, height (m), and its columns of motion and stress with their units."""
+    """A record: height (m), and its columns of motion and stress with their units."""
 
     name: str
-    file: str
-    toml: str
     height: float
     motion: tuple[str, float] = ("displacement_m", 1.0)  # m per unit
     stress: tuple[str, float] = ("stress_Pa", 1.0)  # Pa per unit
 
 
 RECORDS = (
-    Real("cartilage 1", "cartilage-impact/test_1_impact.csv", CARTILAGE, 0.563e-3),
-    Real("cartilage 3", "cartilage-impact/test_3_impact.csv", CARTILAGE, 0.563e-3),
+    Real("cartilage 1", 0.563e-3),
+    Real("cartilage 3", 0.563e-3),
+    Real("lattice drop", 20e-3, stress=("specific_force_N_per_kg", 1.0 / 400e-6)),
     Real(
-        "lattice drop", "lattice-impact/Hex_Diamond_contact.csv", LATTICE, 20e-3,
-        stress=("specific_force_N_per_kg", 1.0 / 400e-6),
+        "aluminium foam", 15e-3, ("reference_engineering_strain", 15e-3),
+        ("reference_engineering_stress_MPa", 1e6),
     ),
-    Real(
-        "aluminium foam", "aluminium-foam/stress_strain_rate.csv", ALUMINIUM, 15e-3,
-        ("reference_engineering_strain", 15e-3), ("reference_engineering_stress_MPa", 1e6),
-    ),
-    Real(
-        "shoe foam turbo-comp-2", "shoe-foam/turbo-comp-2_cycle1.csv",
-        SHOE.format("9.66 mm", "7.68 mm"), 9.66e-3,
-    ),
-    Real(
-        "shoe foam leap-comp-3", "shoe-foam/leap-comp-3_cycle1.csv",
-        SHOE.format("10.68 mm", "7.80 mm"), 10.68e-3,
-    ),
+    Real("turbo-comp-2", 9.66e-3),
+    Real("leap-comp-3", 10.68e-3),
 )  # fmt: skip
 
 
@@ -108,9 +68,9 @@ class Judge:
     peak: float  # Pa, above that
 
     @classmethod
-    def of(cls, real: Real, data: Path) -> Judge:
+    def of(cls, real: Real, path: Path) -> Judge:
         """Read a file."""
-        table = pd.read_csv(data / real.file)
+        table = pd.read_csv(path)
         instants = table["time_s"].to_numpy(float)
         moved = table[real.motion[0]].to_numpy(float) * real.motion[1]
         stress = table[real.stress[0]].to_numpy(float) * real.stress[1]
@@ -141,12 +101,11 @@ class Judge:
                 yield f"misfit of {name} {100.0 * misfit:.0f} %"
 
 
-def fits(data: Path, folder: Path) -> Iterator[dict[str, object]]:
+def fits(folder: Path) -> Iterator[dict[str, object]]:
     """Yield one row for each fit of the six records."""
     for real in RECORDS:
-        toml, judge = folder / "test.toml", Judge.of(real, data)
-        toml.write_text(real.toml)
-        test = ff.read_test(data / real.file, toml)
+        path = records.place(real.name, folder)
+        judge, test = Judge.of(real, path), ff.read_test(path)
         for drive in (None, "displacement"):
             for model, terms in MODELS.items():
                 began = time.perf_counter()
@@ -176,18 +135,12 @@ def law_of(model: str, terms: int) -> str:
 # ------------------------------------------------------------------------- plain least squares
 
 
-def loops(data: Path, folder: Path) -> Iterator[ff.Measurement]:
+def loops(folder: Path) -> Iterator[ff.Measurement]:
     """Yield every loop at hand: the records above, shoe foams, mycelium, lattices in cycles."""
-    for real in RECORDS[:4]:
-        toml = folder / "test.toml"
-        toml.write_text(f'name = "{real.name}"\n{real.toml}')
-        yield ff.read_test(data / real.file, toml)
-    yield from first_cycles(data, folder)
-    for path in sorted((data / "mycelium-rates").glob("*-1_raw.txt")):
-        yield ff.read_test(path, studies.mycelium(path, folder))
-    for path in sorted((data / "lattice-cycles").glob("*.csv")):
-        toml = studies.write_specimen(folder / "l.toml", "12 mm", "20 mm", studies.LATTICE)
-        yield ff.read_test(path, toml)
+    mycelium = (f"outplane-{period}-1" for period in ("2s", "4s", "80s"))
+    shoe = (*records.SHOE_FOAM, *records.HEELS)
+    for name in (*(real.name for real in RECORDS[:4]), *shoe, *mycelium, *records.LATTICES):
+        yield ff.read_test(records.place(name, folder))
 
 
 def bistable(values: Array, strain: Array, _: Array) -> Array:
@@ -252,9 +205,9 @@ def plain_misfit(test: ff.Measurement, model: str, zero: float, *, starts: int =
     return best
 
 
-def compared(data: Path, folder: Path) -> Iterator[dict[str, object]]:
+def compared(folder: Path) -> Iterator[dict[str, object]]:
     """Yield one row for each loop and law: the misfit of the fit and of plain least squares."""
-    for test in loops(data, folder):
+    for test in loops(folder):
         for model, terms in MODELS.items():
             result = ff.fit(test, model=model, relaxation=terms, drive="displacement")
             zero = result.parameters.get("displacement_zero")
@@ -270,10 +223,10 @@ def compared(data: Path, folder: Path) -> Iterator[dict[str, object]]:
 def main() -> None:
     """Fit all records and write tables and page."""
     args = studies.arguments(__doc__, HERE).parse_args()
-    data = studies.measurements("cartilage-impact", "lattice-impact", "aluminium-foam", "shoe-foam")
+    studies.measurements("cartilage-impact", "lattice-impact", "aluminium-foam", "shoe-foam")
     with tempfile.TemporaryDirectory() as made:
-        six = studies.said(fits(data, Path(made)))
-        every = studies.said(compared(data, Path(made)))
+        six = studies.said(fits(Path(made)))
+        every = studies.said(compared(Path(made)))
     studies.write_csv(six, args.out / "fits.csv")
     studies.write_csv(every, args.out / "loops.csv")
     wrong, worst = six[six["excluded"] != "nothing"], every.loc[every["fit over plain"].idxmax()]

@@ -89,7 +89,7 @@ class Slow:
 
 @dataclass(frozen=True)
 class Record:
-    """A record in SI, compression positive: `time` of the file, noisy and clean channels.
+    """A record in SI, compression positive: `time` of the file, noisy channels.
 
     `truth` contains the true parameters by foamfit's names, and contact_time (s) and
     displacement_zero (m), the values of the file's time and displacement at contact; for an impact
@@ -99,7 +99,6 @@ class Record:
     setup: Impact | Slow
     time: Array
     channels: dict[str, Array]
-    clean: dict[str, Array]
     noise: dict[str, float]
     truth: dict[str, float]
     rig: Rig
@@ -110,20 +109,6 @@ class Record:
     def model(self) -> str:
         """Value of `--model`."""
         return self.setup.law
-
-    def written_so(self, zero: float = 0.0, clock: float = 0.0, skip: int = 0) -> Record:
-        """Return the same samples with another zero of the motion (m, added) and clock (s, added).
-
-        The first `skip` rows are omitted.
-        """
-        shift = {"displacement": zero}
-        channels = {c: (v + shift.get(c, 0.0))[skip:] for c, v in self.channels.items()}
-        clean = {c: (v + shift.get(c, 0.0))[skip:] for c, v in self.clean.items()}
-        truth = dict(self.truth)
-        truth["contact_time"] += clock
-        truth["displacement_zero"] += zero
-        time = self.time[skip:] + clock
-        return replace(self, time=time, channels=channels, clean=clean, truth=truth)
 
 
 def draw_bistable(rng: np.random.Generator) -> Bistable:
@@ -287,7 +272,7 @@ def recorded(
         "striker_mass": rig.mass,
     }
     time = origin + np.arange(len(own)) * step
-    return Record(setup, time, channels, clean, sizes, truth, rig, course, f"{said} m/s")
+    return Record(setup, time, channels, sizes, truth, rig, course, f"{said} m/s")
 
 
 def slow_motion(setup: Slow, peak: float, rng: np.random.Generator) -> Motion:
@@ -355,7 +340,7 @@ def slow(setup: Slow, seed: int) -> Record:
     ranges["displacement"] *= not setup.exact
     channels, sizes = noisy(clean, ranges, setup.noise, 1.0, seed)
     truth = parameters(rig.springs) | {"contact_time": course.start, "displacement_zero": zero}
-    return Record(setup, own, channels, clean, sizes, truth, rig, course)
+    return Record(setup, own, channels, sizes, truth, rig, course)
 
 
 def write(record: Record, folder: Path, name: str = "test") -> Path:

@@ -168,7 +168,7 @@ class Rig:
             truth = follow(self, self, time)
         else:
             drive = _Driven(self.motion.at(time) - self.motion.at(time[:1])[0])
-            truth = follow(self, drive, time - time[0])
+            truth = follow(self, drive, time)
         if truth.why:
             raise RuntimeError(truth.why)
         return truth

@@ -20,6 +20,7 @@ import foamfit as ff
 from foamfit.text import percent
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import records
 import studies
 
 HERE = Path(__file__).parent
@@ -97,11 +98,12 @@ def page(frame: pd.DataFrame) -> None:
 
 def main() -> None:
     studies.arguments(__doc__).parse_args()
-    data = studies.measurements("shoe-foam-twins") / "shoe-foam-twins"
+    studies.measurements("shoe-foam-twins")
     rows, numbers = [], list(range(1, COUNT + 1))
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        studies.place_twins(data, folder)
+        for name in records.HEELS:
+            records.place(name, folder)
         for group in GROUPS:
             for left in numbers:
                 others = [i for i in numbers if i != left]

@@ -17,6 +17,7 @@ from scipy.optimize import minimize_scalar
 
 import foamfit as ff
 from scenes import Point, Spec, designed
+from studies import MICROSCALE
 
 SEED = 2027
 
@@ -249,8 +250,6 @@ def long(rng: Generator, number: int) -> Spec:
 
 
 # ------------------------------------------------------------------------- springs with memory
-
-MICROSCALE = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
 
 WORN = ("stiffening", "softening", "weakening")
 

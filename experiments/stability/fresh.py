@@ -1,10 +1,10 @@
 """Is any result of the solver wrong? Random scenes and judges that share no code with it.
 
 Method, families of scenes and answer: README.md. One command runs them and writes a row per scene
-and rtol, those of the last four families to worn.csv:
+and rtol to fresh.csv:
 
-    python experiments/stability/fresh.py                 # --out writes all to another file
-    python experiments/stability/fresh.py --page          # README.md of fresh.csv and worn.csv
+    python experiments/stability/fresh.py                 # --out writes to another file
+    python experiments/stability/fresh.py --page          # README.md of fresh.csv
 
 Another checkout's solver is judged with PYTHONPATH=that/checkout/src.
 """
@@ -17,7 +17,6 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +32,7 @@ from independent import LOOSE, Truth, follow, judge, over_range
 from scenes import Scene, Spec, scene_from
 
 HERE = Path(__file__).parent
+KEPT = HERE / "fresh.csv"
 Array = NDArray[np.float64]
 RTOLS = (1e-4, 1e-6, 1e-8)
 MOST = {"base": 10_000_000, "long": 20_000_000}  # limit of the judge: steps times springs
@@ -41,15 +41,11 @@ BAD, POOR = 3.0, 1.0  # error over rtol
 SLOPE_BAR = 1e-3  # allowed error of a derivative over its range, for rtol up to 1e-5
 
 
-def follower(scene: Scene, spec: Spec) -> Callable[[Any, Any, Array, float, int], Truth]:
-    """Return the judge of a scene."""
-    if spec.get("judge") == "roots":
-        import roots  # only this judge needs mpmath
+def by_roots(scene: Scene) -> Truth:
+    """Return the solution of the judge that integrates nothing."""
+    import roots  # only this judge needs mpmath
 
-        return roots.follow
-    if isinstance(scene[1], ff.Impact):
-        return follow
-    return lambda chain, drive, time, *bounds: follow(chain, drive, time - time[0], *bounds)
+    return roots.follow(*scene)
 
 
 # ------------------------------------------------------------------------------- the derivatives
@@ -90,7 +86,8 @@ def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[n
                 scene = scene_from(other)
             except ValueError:  # the scene is at the limit of admissible parameters
                 return None
-            truth = follower(scene, spec)(*scene, LOOSE, most)
+            rooted = spec.get("judge") == "roots"
+            truth = by_roots(scene) if rooted else follow(*scene, LOOSE, most)
             if truth.why:
                 return None
             sides.append(np.vstack((truth.base_stress, truth.displacement)))
@@ -157,7 +154,7 @@ def lines_of(
     spec, most = spec_of(family, number), most or MOST.get(family, USUAL_MOST)
     scene = scene_from(spec)
     began = time.perf_counter()
-    truth = judge(*scene, most, follower(scene, spec))
+    truth = by_roots(scene) if spec.get("judge") == "roots" else judge(*scene, most)
     took = time.perf_counter() - began
     known: dict[str, Any] = {}
     lines = [
@@ -252,18 +249,9 @@ def wrong(lines: pd.DataFrame) -> pd.DataFrame:
 # ---------------------------------------------------------------------------------------- the page
 
 
-def store(lines: pd.DataFrame, out: Path | None) -> None:
-    """Write the rows to a file, or to fresh.csv and worn.csv."""
-    worn = lines.family.isin(REMEMBERING)
-    parts = {HERE / "fresh.csv": lines[~worn], HERE / "worn.csv": lines[worn]}
-    for path, part in ({out: lines} if out else parts).items():
-        if len(part):
-            part.to_csv(path, index=False, float_format="%.6g")
-
-
 def write_page() -> None:
     """Write README.md from the stored scenes."""
-    lines = pd.concat([pd.read_csv(HERE / name) for name in ("fresh.csv", "worn.csv")])
+    lines = pd.read_csv(KEPT)
     lines["reason"] = lines.reason.fillna("")
     table, plain = summary(lines), set(FAMILIES) - {*MEMORY, *REMEMBERING}
     tables = {
@@ -299,11 +287,9 @@ def main() -> None:
     )
     ask.add_argument("--family", action="append", choices=FAMILIES)
     ask.add_argument("--rtol", type=float, action="append")
-    ask.add_argument("--out", type=Path, help="instead of fresh.csv and worn.csv")
+    ask.add_argument("--out", type=Path, default=KEPT)
     ask.add_argument("--processes", type=int, default=2, choices=(1, 2))
-    ask.add_argument(
-        "--page", action="store_true", help="write README.md of fresh.csv and worn.csv"
-    )
+    ask.add_argument("--page", action="store_true", help="write README.md of fresh.csv")
     given = ask.parse_args()
     rtols = tuple(given.rtol or RTOLS)
     if given.page:
@@ -317,9 +303,9 @@ def main() -> None:
         lines += found
         if len(lines) % (50 * len(rtols)) == 0:
             print(f"{len(lines) // len(rtols)} scenes", file=sys.stderr, flush=True)
-            store(pd.DataFrame(lines), given.out)
+            studies.write_csv(lines, given.out, 6)
     table = pd.DataFrame(lines)
-    store(table, given.out)
+    studies.write_csv(table, given.out, 6)
     with pd.option_context("display.width", 250, "display.max_columns", 30):
         print(summary(table).to_string(index=False))
         columns = ["scene", "rtol", "error", "slope", "method", "steps"]

@@ -134,8 +134,8 @@ def _root(springs: list[_Linear], heights: list[Any], top: Any, s: Any) -> Any:
     return findroot(miss, (low, high), solver="bisect", tol=close, maxsteps=400, verify=False)
 
 
-def follow(chain: Any, drive: Any, time: Array, tol: float = 0.0, most: int = 0) -> Truth:
-    """Follow a chain over the samples of a known displacement of its top; `tol` has no effect."""
+def follow(chain: Any, drive: Any, time: Array) -> Truth:
+    """Follow a chain over the samples of a known displacement of its top."""
     with mp.workdps(DIGITS):
         springs = [_spring(spring) for spring in chain.springs]
         heights = [mpf(h) for h in chain.heights]
@@ -148,4 +148,4 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = 0.0, most: int = 0)
             nodes[:, j] = np.cumsum([float(h * e) for h, e in zip(heights, strains, strict=True)])
             for p in springs:
                 p.keep(s)
-    return Truth(nodes, base, None)
+    return Truth(nodes, base, None, unsure=0.0)

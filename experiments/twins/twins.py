@@ -24,6 +24,7 @@ from foamfit.springs.parameters import unit_of
 from foamfit.text import percent, significant
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import records
 import studies
 from studies import BLUE, GREY, VERMILION
 
@@ -256,10 +257,11 @@ def main() -> None:
     parser = studies.arguments(__doc__)
     parser.add_argument("--page", action="store_true", help="only write picture and page")
     options = parser.parse_args()
-    data = studies.measurements("shoe-foam-twins") / "shoe-foam-twins"
+    studies.measurements("shoe-foam-twins")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        studies.place_twins(data, folder)
+        for name in records.HEELS:
+            records.place(name, folder)
         if not options.page:
             measure(folder)
         write(loops(folder, FIRST))

@@ -24,9 +24,9 @@ from typing import Any
 import foamfit as ff
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import records
 import studies
-from real_foams import first_cycles
-from real_records import RECORDS, plain_misfit
+from real_records import plain_misfit
 
 HERE = Path(__file__).parent
 STARTS = 16  # of plain least squares
@@ -41,17 +41,6 @@ FITS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("leap-comp-2", {"model": "bistable+bistable"}),
     ("turbo-comp-1", {"model": "bistable+bistable"}),
 )
-
-
-def tests(data: Path, folder: Path) -> dict[str, ff.Measurement]:
-    """Return the measurements by name."""
-    found = {test.name: test for test in first_cycles(data, folder, ("turbo-comp", "leap-comp"))}
-    for real in RECORDS:
-        if real.name in {name for name, _ in FITS}:
-            toml = folder / "test.toml"
-            toml.write_text(real.toml)
-            found[real.name] = ff.read_test(data / real.file, toml)
-    return found
 
 
 def plain(test: ff.Measurement) -> tuple[float, float]:
@@ -88,9 +77,10 @@ def rows(found: dict[str, ff.Measurement]) -> Iterator[dict[str, object]]:
 def main() -> None:
     """Fit all records and write the table."""
     args = studies.arguments(__doc__, HERE).parse_args()
-    data = studies.measurements("cartilage-impact", "aluminium-foam", "shoe-foam")
+    studies.measurements("cartilage-impact", "aluminium-foam", "shoe-foam")
     with tempfile.TemporaryDirectory() as made:
-        found = tests(data, Path(made))
+        names = {name for name, _ in FITS}
+        found = {name: ff.read_test(records.place(name, Path(made))) for name in names}
         table = studies.said(rows(found))
         seconds, misfit = plain(found["turbo-comp-2"])
     studies.write_page(

@@ -1,11 +1,10 @@
 """A gauge that sticks and then jumps is detected and bridged, without false detections."""
 
-import csv
-
 import numpy as np
 import pytest
 
-from conftest import DATA, needs_data, specimen_toml
+import records
+from conftest import DATA, needs_data, write_csv
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Record, Specimen
 from foamfit.data.prepare import condition
@@ -51,13 +50,8 @@ def recorded(folder, shown, stress, *, noise=(0.0, 0.0), timed=True, seed=0):
     columns = {"displacement (mm)": shown, "stress (kPa)": stress}
     if timed:
         columns = {"time (s)": STEP * np.arange(shown.size)} | columns
-    path = folder / "test.csv"
-    np.savetxt(
-        path, np.column_stack(list(columns.values())), delimiter=",", header=",".join(columns),
-        comments="", fmt="%.9g",
-    )  # fmt: skip
-    path.with_suffix(".toml").write_text(SPECIMEN)
-    return read_test(path)
+    path, head = folder / "test.csv", ",".join(columns)
+    return read_test(write_csv(path, head, *columns.values(), toml=SPECIMEN))
 
 
 def conditioned(shown, stress, noise):
@@ -181,11 +175,8 @@ def test_a_gauge_that_slips_after_a_hold_at_constant_stress_has_not_stood_still(
 @needs_data
 def test_the_gauge_of_the_shoe_foams_stands_still_at_the_top(tmp_path):
     """In ten tests (arXiv:2602.12694) 34 to 76 samples stand still before a jump of 0.4 to 1 %."""
-    with (DATA / "shoe-foam-twins" / "specimens.csv").open() as table:
-        specimens = list(csv.DictReader(table))
-    for specimen in specimens[::3]:
-        toml = specimen_toml(tmp_path, specimen["height_mm"], specimen["diameter_mm"])
-        test = read_test(DATA / "shoe-foam-twins" / f"{specimen['test']}_raw.txt", toml)
+    for name in records.HEELS[::3]:
+        test = read_test(records.place(name, tmp_path, DATA))
         (note,) = notes(test)
         ((start, end),) = test.standstills
         (dropped,) = (item for item in test.rows.dropped if "stands still" in item.why)

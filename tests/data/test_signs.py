@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import fabricated
-from conftest import DATA, needs_data, refused, run, specimen_toml
+from conftest import DATA, needs_data, refused, run, specimen_toml, write_csv
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.report.summary import summary_text
@@ -59,11 +59,7 @@ def motions() -> dict[str, np.ndarray]:
 def written(folder: Path, toml: str = SPECIMEN, name: str = "test", **columns: np.ndarray) -> Path:
     """Write a table; the keys are headers with _ for blanks around units."""
     path = folder / f"{name}.csv"
-    rows = zip(*columns.values(), strict=True)
-    lines = [",".join(columns), *(",".join(f"{v:.9g}" for v in row) for row in rows)]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    path.with_suffix(".toml").write_text(toml, encoding="utf-8")
-    return path
+    return write_csv(path, ",".join(columns), *columns.values(), toml=toml)
 
 
 def same(one: Measurement, other: Measurement) -> None:

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from conftest import write_csv
 from foamfit.data.csv_file import read_test
 from foamfit.data.energy import audit, describe
 from foamfit.errors import InputError
@@ -18,11 +19,7 @@ def written(folder, toml, **columns):
     given = columns or {
         "time (s)": TIME, "stress (MPa)": 2.0 * LOOP, "displacement (mm)": 4.0 * LOOP,
     }  # fmt: skip
-    path = folder / "test.csv"
-    table = np.column_stack(list(given.values()))
-    np.savetxt(path, table, delimiter=",", header=",".join(given), comments="")
-    path.with_suffix(".toml").write_text(toml, encoding="utf-8")
-    return path
+    return write_csv(folder / "test.csv", ",".join(given), *given.values(), toml=toml)
 
 
 def specimen(height='"10 mm"', area='area = "100 mm^2"'):

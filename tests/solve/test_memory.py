@@ -121,14 +121,14 @@ def difference(one: Array, other: Array) -> float:
 
 
 def names_of(given: ff.Chain) -> list[str]:
-    """Return the names of all parameters of the chain."""
+    """Return the names of all parameters of the chain that are not zero."""
     names = []
     for i, spring in enumerate(given.springs, start=1):
         own = list(spring.law.names)
         for k in range(1, len(spring.relaxation) + 1):
             own += [f"g{k}", f"tau{k}"]
         names += [f"s{i}_{n}" for n in [*own, "height"]]
-    return [*names, "site_eta"]
+    return [name for name in (*names, "site_eta") if value_of(given, name) != 0.0]
 
 
 def value_of(given: ff.Chain, name: str) -> float:
@@ -190,7 +190,7 @@ EXACT = [
 @pytest.mark.parametrize("name", EXACT)
 def test_derivatives_by_all_parameters_are_those_of_differences(name: str) -> None:
     given, drive = SCENES[name]
-    names = [n for n in names_of(given) if value_of(given, n) != 0.0]
+    names = names_of(given)
     run = ff.simulate(given, drive, TIME, 1e-10, sensitivities=names)
     away = np.abs(TIME - (run.contact_end or -1.0)) > 6e-5  # derivatives jump at the end of contact
     for short in names:
@@ -208,6 +208,8 @@ def test_derivatives_by_all_parameters_are_those_of_differences(name: str) -> No
                 got = getattr(run.sensitivities[short], what)
                 size = max(np.abs(got).max(), 2e-5 * np.abs(getattr(run, what)).max() / abs(value))
                 misses[-1].append(np.abs(wanted - got)[..., away].max() / size)
+            if np.min(misses, axis=0).max() < 1e-6:
+                break
         assert np.min(misses, axis=0).max() < 1e-6, short
 
 
@@ -217,7 +219,7 @@ def test_a_chain_may_start_loaded(moved: bool) -> None:
     given = chain([relaxing(MICRO), relaxing(BISTABLE), FOAM])
     shape = 0.3 + 0.5 * np.sin(np.linspace(0.0, 6.0, TIME.size))
     drive: Drive = ff.DisplacementDrive(4e-4 * shape) if moved else ff.StressDrive(1.2e6 * shape)
-    names = [n for n in names_of(given) if value_of(given, n) != 0.0]
+    names = names_of(given)
     run = ff.simulate(given, drive, TIME, 1e-10, sensitivities=names)
     strain = np.diff(run.displacement[:, 0], prepend=0.0) / given.heights
     loaded = [s.stress(np.array([0.0, e]))[-1] for s, e in zip(given.springs, strain, strict=True)]

@@ -9,7 +9,7 @@ import pytest
 
 import foamfit as ff
 import fresh
-from independent import Truth, follow, over_range
+from independent import follow, over_range
 
 # Narrower and wider snap-through than snap-back, snaps with a relative spread of 1e-3, and
 # snap-back above snap-through at most ranks.
@@ -80,32 +80,11 @@ def test_what_relaxes_dies_out(law: tuple[float, ...]) -> None:
 # -------------------------------------------------------------------------------------- judgement
 
 
-def hasten_roots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the judge by roots follow each scene once, with 22 digits instead of 30.
-
-    Its result does not depend on rtol, and the change is 1e-10 of the range of a curve.
-    """
-    import roots
-
-    whole = roots.follow
-    known: dict[int, tuple[ff.Chain, Truth]] = {}
-
-    def once(chain: ff.Chain, *rest: Any) -> Truth:
-        if id(chain) not in known:
-            # Keeping the chain prevents its id from being reused.
-            known[id(chain)] = chain, whole(chain, *rest)
-        return known[id(chain)][1]
-
-    monkeypatch.setattr(roots, "DIGITS", 22)
-    monkeypatch.setattr(roots, "follow", once)
-
-
 @pytest.mark.parametrize("family", FRESH)
 def test_fresh_scenes_with_memory(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Prescribed motions were once refused for their time origin and for narrow and wide snaps."""
     if family.endswith("motion"):
-        pytest.importorskip("mpmath")
-        hasten_roots(monkeypatch)
+        monkeypatch.setattr(pytest.importorskip("roots"), "DIGITS", 22)  # changes 1e-10 of a curve
     judged = 0
     for number in FRESH[family]:
         for line in fresh.lines_of((family, number, (1e-4, 1e-6)), 400_000):

@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from numba.core.caching import _CacheLocator
 
 import fabricated
 from conftest import EXPERIMENTS, run, without_pictures
@@ -112,18 +114,23 @@ def test_the_first_use_says_that_it_compiles(
 
 def test_a_spring_does_not_load_what_was_compiled_of_another_source(tmp_path: Path) -> None:
     """Once, the strain of a spring ran code of an older layout before any check."""
-    code = "import foamfit as ff; s = ff.LinearSpring(1e6); print(float(s.strain([0, 1e5])[1]))"
-    given = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-c", code]
-    told = subprocess.run(command, env=given, capture_output=True, text=True, check=True)
-    files = sorted(tmp_path.rglob("*.nb[ci]"))
+    for module, stored in ((bistable, bistable.fill), (loop, loop.integrate)):
+        folder = tmp_path / _CacheLocator.get_suitable_cache_subpath(module.__file__)
+        folder.mkdir()
+        for path in Path(stored.stats.cache_path).glob("*.nb[ci]"):
+            shutil.copy2(path, folder)
+    files = [*tmp_path.rglob("bistable.strain_linear-*"), *tmp_path.rglob("samples._samples-*")]
     assert len({path.parent for path in files}) == 2
     for path in files:
         path.write_bytes(b"of another source")
         os.utime(path, (0.0, 0.0))
-    again = subprocess.run(command, env=given, capture_output=True, text=True, check=True)
-    assert again.stdout == told.stdout
+    code = "import foamfit as ff; s = ff.LinearSpring(1e6); print(float(s.strain([0, 1e5])[1]))"
+    given = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", code]
+    told = subprocess.run(command, env=given, capture_output=True, text=True, check=True)
+    assert told.stdout == "0.1\n"
     assert all(path.stat().st_mtime > 0.0 for path in tmp_path.rglob("*.nb[ci]"))
+    assert {path.parent for path in tmp_path.rglob("*.nbi")} == {path.parent for path in files}
 
 
 def test_what_is_compiled_where_it_is_needed_is_announced_once(

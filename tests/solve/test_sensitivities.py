@@ -4,16 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_memory import BISTABLE, LINEAR, chain, names_of, value_of, with_value
 
 import foamfit as ff
 from foamfit.solve.plan import Motion, plan
 from foamfit.springs.chain import Drive
 from foamfit.springs.spring import Spring
 
-AREA = 1.9635e-5
 TIME = np.linspace(0.0, 8e-4, 81)
-BISTABLE = ff.BistableSpring(5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6)
-LINEAR = ff.LinearSpring(60e6)
 SOFT = ff.BistableSpring(2e6, 60e6, -0.3446e6, 0.35, 0.71, 6.8e6, 1.05e6)
 PAIR = [LINEAR, SOFT]
 IMPACT = ff.Impact(7e-3, 2.0)
@@ -26,11 +24,6 @@ MOVED = ff.DisplacementDrive(0.5e-3 * PULSE + 1e-5)
 
 def damped(springs: list[Spring], *eta: float) -> list[Spring]:
     return [replace(spring, eta=own) for spring, own in zip(springs, eta, strict=True)]
-
-
-def chain(springs: list[Spring], masses: list[float] | None = None, site: float = 0.0) -> ff.Chain:
-    heights = [1.19e-3] if len(springs) == 1 else [0.7e-3, 0.49e-3, 0.3e-3][: len(springs)]
-    return ff.Chain(springs, heights, AREA, masses, site)
 
 
 SCENES: dict[str, tuple[ff.Chain, Drive]] = {
@@ -88,35 +81,6 @@ STIFF: dict[str, tuple[ff.Chain, Drive]] = {
 }
 
 
-def names_of(scene: ff.Chain) -> list[str]:
-    """Return the parameters of a chain except for dashpots of zero."""
-    names = ["site_eta"] if scene.site_damping > 0.0 else []
-    for i, spring in enumerate(scene.springs, start=1):
-        own = spring.law.names
-        names += [f"s{i}_{short}" for short in own if short != "eta" or spring.eta > 0.0]
-        names.append(f"s{i}_height")
-    return names
-
-
-def value_of(scene: ff.Chain, name: str) -> float:
-    if name == "site_eta":
-        return scene.site_damping
-    spring, short = int(name[1]) - 1, name[3:]
-    return scene.heights[spring] if short == "height" else getattr(scene.springs[spring], short)
-
-
-def moved(scene: ff.Chain, name: str, by: float) -> ff.Chain:
-    springs, heights, site = list(scene.springs), list(scene.heights), scene.site_damping
-    if name == "site_eta":
-        site += by
-    elif name.endswith("height"):
-        heights[int(name[1]) - 1] += by
-    else:
-        i = int(name[1]) - 1
-        springs[i] = replace(springs[i], **{name[3:]: value_of(scene, name) + by})
-    return ff.Chain(springs, heights, scene.area, scene.masses, site)
-
-
 @pytest.mark.parametrize("label", [*SCENES, *STIFF])
 def test_sensitivities_against_differences(label: str) -> None:
     """Within 1e-6 of the response's own range, away from switches of branch."""
@@ -133,8 +97,8 @@ def test_sensitivities_against_differences(label: str) -> None:
     for name in names:
         size = value_of(scene, name)
 
-        def bare(by: float, name: str = name) -> Motion:
-            other = moved(scene, name, by)
+        def bare(by: float, name: str = name, size: float = size) -> Motion:
+            other = with_value(scene, name, size + by)
             return plan(other, drive, time).run(other.arrays.rows, other.arrays.heights, rtol)
 
         def slope(step: float, size: float = size) -> tuple[np.ndarray, ...]:

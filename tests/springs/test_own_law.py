@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 import pickle
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,8 +14,8 @@ from numba import njit
 from scipy.integrate import solve_ivp
 
 import foamfit as ff
+import power_law_damper
 from foamfit.springs import laws
-from foamfit.springs.law import derived_points
 from foamfit.springs.laws import Law
 
 FILE = Path(__file__).parents[2] / "notebooks" / "bouc_wen.py"
@@ -64,42 +63,11 @@ def test_the_law_follows_a_motion_as_scipy_does(bouc_wen: Law) -> None:
     np.testing.assert_allclose(back, strain, rtol=0, atol=1e-11)
 
 
-A, D, C, E = range(4)  # branches of the bistable law
-points_of = njit(derived_points)
-
-
-def _bistable(p, x, strain, branch):  # type: ignore[no-untyped-def]
-    k0, kc, dsigma, eps_a, eps_c, plus, minus = p
-    sigma_a = k0 * eps_a / (1.0 - eps_a)
-    sigma_c = sigma_a + dsigma
-    if branch == D:
-        return sigma_a + plus * (strain - eps_a)
-    if branch == E:
-        return sigma_c + minus * (strain - eps_c)
-    k, r = (k0, strain) if branch == A else (kc, strain - eps_c + sigma_c / (kc + sigma_c))
-    return k * r / (1.0 - r) if r.real < 1.0 else math.inf
-
-
-def _ends(p, x, strain, branch, out):  # type: ignore[no-untyped-def]
-    k0, kc, dsigma, eps_a, eps_c, plus, minus = p
-    points = points_of(k0.real, kc.real, dsigma.real, eps_a.real, eps_c.real, plus.real, minus.real)
-    if branch != A:
-        out[0] = eps_a if branch == D else eps_c if branch == C else points[3]
-    if branch != C:
-        out[1] = points[4] if branch == D else eps_c if branch == E else eps_a
-
-
-def _snap(p, x, strain, branch, up):  # type: ignore[no-untyped-def]
-    if up:
-        return D if branch == A else C
-    return E if branch == C else A
+_plain = njit(power_law_damper.stress)  # of the paper's spring alone
 
 
 def _smeared(p, x, strain, branch):  # type: ignore[no-untyped-def]
     return _plain(p, x, strain, branch) + 0.0 * x[0]
-
-
-_plain = njit(_bistable)
 
 
 def _still(p, x, strain, branch, out):  # type: ignore[no-untyped-def]
@@ -109,11 +77,9 @@ def _still(p, x, strain, branch, out):  # type: ignore[no-untyped-def]
 @functools.cache
 def copy(internal: int) -> Law:
     """Register the bistable law; with an internal variable that has no effect, if one is wanted."""
-    functions = (
-        ff.Functions(_smeared, _still, ends=_ends, switch=_snap)
-        if internal
-        else ff.Functions(_bistable, ends=_ends, switch=_snap)
-    )
+    given = (_smeared, _still) if internal else (power_law_damper.stress,)
+    ends = {"ends": power_law_damper.ends, "switch": power_law_damper.switch}
+    functions = ff.Functions(*given, **ends)
     copied = {"kind": f"copy-{internal}", "spring": None, "numbered": tuple("adce")}
     return laws.register(
         dataclasses.replace(
@@ -169,20 +135,20 @@ def test_a_registered_copy_agrees_with_the_built_in_law(
             np.testing.assert_allclose(b, a, 0, bar, err_msg=f"{kind}, {name}")
 
 
-# Weights of the central differences of order 8.
-WEIGHTS = np.array([4 / 5, -1 / 5, 4 / 105, -1 / 280])
+# Weights of the central differences of order 4.
+WEIGHTS = np.array([2 / 3, -1 / 12])
 
 
 @pytest.mark.parametrize("place", ["alone", "in series", "below a mass"])
 @pytest.mark.parametrize("drive", ["impact", "stress", "displacement"])
 def test_derivatives_are_exact(bouc_wen: Law, drive: str, place: str) -> None:
-    """They agree with differences of order 8, except at kinks of the curves."""
+    """They agree with differences of order 4, except at kinks of the curves."""
     given = {
         "impact": ff.Impact(0.05, 3.0),
         "stress": ff.StressDrive(4e5 * SHAPE + 1e4),
         "displacement": ff.DisplacementDrive(4e-3 * SHAPE + 1e-4),
     }[drive]
-    time = 3.0 * TIME if drive == "impact" else 1e3 * TIME
+    time = (3.0 if drive == "impact" else 100.0) * TIME
 
     def run(values: np.ndarray, rtol: float, **more: object) -> ff.Response:
         own = bouc_wen.make((*values, 30.0), ((0.3, 2e-4),))
@@ -293,14 +259,14 @@ def _agree(got: ff.Response, want: ff.Response, names: dict[str, str], bar: floa
 
 
 def test_variables_that_decay_are_as_exact_as_relaxation(bouc_wen: Law) -> None:
-    terms = [(0.3, 1e-6), (0.5, 0.02), (0.2, 0.7)]
+    terms = [(0.3, 1e-6), (0.2, 0.7)]
     time = np.linspace(0.0, 1.0, 301)
     drive = ff.DisplacementDrive(HEIGHT * 0.4 * np.sin(3.0 * time) ** 2)
     names = {"s1_k": "s1_k", "s1_height": "s1_height"}
-    for k in range(3):
+    for k in range(2):
         names |= {f"s1_s{k}": f"s1_g{k + 1}", f"s1_t{k}": f"s1_tau{k + 1}"}
     springs = (
-        prony(3).make([2e6, *np.transpose(terms).ravel(), 0.0], ()),
+        prony(2).make([2e6, *np.transpose(terms).ravel(), 0.0], ()),
         prony(0).make([2e6, 0.0], terms),
     )
     got, want = (

@@ -125,7 +125,9 @@ def test_nothing_of_a_record_is_carried_to_another(together, fitted):
     folder, records, _ = together
     other = folder / "other"
     other.mkdir()
-    rig.write(records[0].written_so(zero=2e-3, clock=5.0, skip=20), other, "t0")
+    moved = {name: values[20:].copy() for name, values in records[0].channels.items()}
+    moved["displacement"] += 2e-3
+    rig.write(replace(records[0], time=records[0].time[20:] + 5.0, channels=moved), other, "t0")
     one, two = (ff.predict(fitted, f / "t0.csv", draws=60) for f in (folder, other))
     assert two.aligned["contact_time"] - one.aligned["contact_time"] == pytest.approx(5.0, abs=1e-6)
     for curve, off in one.misfit.items():

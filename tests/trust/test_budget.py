@@ -17,6 +17,7 @@ from conftest import (
     loop_measurement,
     synthetic_impact,
     synthetic_loop,
+    write_csv,
 )
 from foamfit.data.measurement import Measurement, Specimen
 from foamfit.fitting.problem import make_problem
@@ -76,16 +77,11 @@ def written(folder: Path, *, height: str, area: str, velocity: str = "2 m/s", ma
             noise: float = 1e-4) -> Path:  # fmt: skip
     """Write the same impact as a CSV file of force and motion, with its TOML."""
     _, test = synthetic_impact(noise=noise)
-    path = folder / "impact.csv"
-    table = np.column_stack([test.time * 1e3, test.stress * AREA, test.displacement * 1e3])
-    header = "time (ms),force (N),displacement (mm)"
-    np.savetxt(path, table, "%.12g", ",", header=header, comments="")
-    path.with_suffix(".toml").write_text(
-        f'[specimen]\nheight = "{height}"\narea = "{area}"\n'
-        f'[striker]\nmass = "{mass}"\nvelocity = "{velocity}"\n',
-        encoding="utf-8",
-    )
-    return path
+    columns = test.time * 1e3, test.stress * AREA, test.displacement * 1e3
+    head = "time (ms),force (N),displacement (mm)"
+    toml = f'[specimen]\nheight = "{height}"\narea = "{area}"\n'
+    toml += f'[striker]\nmass = "{mass}"\nvelocity = "{velocity}"\n'
+    return write_csv(folder / "impact.csv", head, *columns, fmt="%.12g", toml=toml)
 
 
 SIZE = {"height": f"{HEIGHT * 1e3:.12g} mm", "area": f"{AREA * 1e6:.12g} mm^2"}

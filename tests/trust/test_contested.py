@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import foamfit as ff
+import records
 import rig
-from conftest import DATA, needs_data, run, specimen_toml, without_pictures
+from conftest import DATA, needs_data, run, without_pictures
 
 QUICK = {"starts": 2, "intervals": "local"}
 
@@ -177,9 +178,7 @@ def test_tests_of_a_joint_fit_have_the_same_default(
 
 @needs_data
 def test_an_impact_on_cartilage_says_which_numbers_are_wrong(tmp_path: Path) -> None:
-    striker = '[striker]\nmass = "358.39 g"\nvelocity = "0.9 m/s"\n'
-    toml = specimen_toml(tmp_path, 0.563, 8.5, striker)
-    test = ff.read_test(DATA / "cartilage-impact" / "test_1_impact.csv", toml)
+    test = ff.read_test(records.place("cartilage 1", tmp_path, DATA))
     result = ff.fit(test, **QUICK)
     assert result.drive == "displacement"
     assert 'velocity = "0.788 m/s" under [striker]' in result.warnings[0]

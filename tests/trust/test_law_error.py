@@ -14,7 +14,7 @@ from scipy.stats import binom
 import foamfit as ff
 import law_error
 import real_foams
-import studies
+import records
 from conftest import DATA, correlated, loop_measurement, needs_data
 from foamfit.api import FitResult
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
@@ -265,11 +265,11 @@ def test_there_is_no_range_where_the_law_follows_the_curves():
 @needs_data
 def test_twins_get_the_same_states(thin_foams, tmp_path):
     states, values = {}, {}
-    for foam in ("turbo-comp", "worn-heel-comp"):
-        for test in real_foams.first_cycles(thin_foams, tmp_path, (foam,)):
-            for name, item in real_foams.varied(ff.fit(test, starts=2)).items():
-                states.setdefault((foam, name), []).append(item.state)
-                values.setdefault((foam, name), []).append(item.value)
+    for specimen in ("turbo-comp-1", "turbo-comp-2", *records.HEELS[5:]):
+        foam, test = specimen[:-2], ff.read_test(records.place(specimen, tmp_path, thin_foams))
+        for name, item in real_foams.varied(ff.fit(test, starts=2)).items():
+            states.setdefault((foam, name), []).append(item.state)
+            values.setdefault((foam, name), []).append(item.value)
     scatter = {key: np.std(own, ddof=1) / abs(np.mean(own)) for key, own in values.items()}
     same = [max(map(own.count, own)) for own in states.values()]
     assert sum(same) >= 0.85 * sum(map(len, states.values()))
@@ -280,19 +280,13 @@ def test_twins_get_the_same_states(thin_foams, tmp_path):
     assert not any("determined" in own for key, own in states.items() if scatter[key] > 0.5)
 
 
-def lattice(folder, name, cycle):
-    toml = folder / "lattice.toml"
-    studies.write_specimen(toml, "12 mm", "20 mm", studies.LATTICE)
-    return ff.read_test(DATA / "lattice-cycles" / f"{name}_raw.csv", toml, cycle=cycle)
-
-
 @needs_data
 @pytest.mark.parametrize(
     ("name", "model", "terms"), [("tpu87-20", "bistable", 0), ("tpu87-50", "microscale", 1)]
 )
 def test_a_slow_error_of_the_law_in_a_short_record_is_no_noise(name, model, terms, tmp_path):
     """The spectrum of 100 samples alone took residuals of 41 and 9 times the noise for noise."""
-    test = lattice(tmp_path, name, 1)
+    test = ff.read_test(records.place(name, tmp_path, DATA), cycle=1)
     found = ff.fit(test, model=model, relaxation=terms, starts=4, intervals="local")
     told = found.noise["stress_strain"]
     assert told["law_error"] > 0.8 * found.misfit["stress_strain"] * told["range"]
@@ -302,6 +296,6 @@ def test_a_slow_error_of_the_law_in_a_short_record_is_no_noise(name, model, term
 @needs_data
 def test_an_uncertain_motion_is_no_excuse_for_an_error_of_the_law(tmp_path):
     """Weighed by the motion's noise, this fit once missed by 1.3 % (record: study of damage)."""
-    test = lattice(tmp_path, "tpu87-35", 10)
+    test = ff.read_test(records.place("tpu87-35", tmp_path, DATA), cycle=10)
     found = ff.fit(test, model="microscale", relaxation=1, starts=4, intervals="local")
     assert found.misfit["stress_strain"] < 0.0035
