@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -40,11 +40,11 @@ UNITS = {"peak_force": "N", "absorbed_energy": "J", "peak_strain": ""}  # quanti
 class Known:
     """What the tests at hand say about the k varied parameters of the springs.
 
-    Parameters are scaled by `sizes` (k,). `bread` (k, k) is JᵀJ and `meat` JᵀΣJ, `missed` the sum
-    of squares of the model error, `share` its RMS over the range of each curve, `stretch` (k,) the
-    ranges of the fits over those to first order, at least 1, `reached` (k,) whether the branch of
-    each parameter was reached. `draws` (d, n) are vectors of parameters that follow the tests about
-    equally well.
+    Parameters are scaled by `sizes` (k,). `draws` (d, n) are vectors of parameters that follow the
+    tests about equally well, `bread` (d, k, k) is JᵀJ there and `meat` JᵀΣJ: slopes in a draw may
+    differ much from those of the fit. `missed` is the sum of squares of the model error, `share`
+    its RMS over the range of each curve, `stretch` (k,) the ranges of the fits over those to first
+    order, at least 1, `reached` (k,) whether the branch of each parameter was reached.
     """
 
     problem: Problem
@@ -63,6 +63,11 @@ class Known:
     def drawn_sizes(self) -> Array:
         """Scale of each parameter in each draw over `sizes`, (d, k)."""
         return np.array([self.problem.sizes(self.names, one) for one in self.draws]) / self.sizes
+
+    def first(self, count: int) -> Known:
+        """Return the same with the first draws only."""
+        few = {name: getattr(self, name)[:count] for name in ("draws", "bread", "meat")}
+        return replace(self, **few)
 
     def with_springs(self, drawn: Array, problem: Problem) -> Array:
         """Return the parameters of another test: drawn springs, and its nuisance parameters."""
@@ -93,6 +98,17 @@ def without_nuisance(rows: Array, k: int) -> Array:
     """Return the last k columns without their part along the others (Frisch & Waugh 1933)."""
     others = np.linalg.qr(rows[:, :-k])[0]
     return np.asarray(rows[:, -k:] - others @ (others.T @ rows[:, -k:]))
+
+
+def information(rows: Array, root: Array) -> tuple[Array, Array]:
+    """Return JᵀJ and JᵀΣJ (k, k) of a test without nuisance parameters.
+
+    `root` (k,) are the standard errors of its fit over those of JᵀJ, so that the covariance of this
+    test alone is that of its fit, D (JᵀJ)⁻¹ D.
+    """
+    bread = rows.T @ rows
+    alone = np.linalg.pinv(bread, rcond=1e-12, hermitian=True) * np.outer(root, root)
+    return bread, bread @ alone @ bread
 
 
 def problem_for(known: Known, candidate: Candidate, rig: Rig) -> Problem:
@@ -194,7 +210,7 @@ class Rival:
             return None
         n = problem.objective.n_data
         rows = rows_of(problem, values, known.names, known.sizes)[:n]
-        root = np.linalg.cholesky(known.bread + TINY * np.eye(k)).T
+        root = np.linalg.cholesky(known.bread[0] + TINY * np.eye(k)).T
         prior = np.hstack([np.zeros((k, rows.shape[1] - k)), root])
         residual = problem.objective.compare(shown, values)[:n]
         return cls(residual, np.vstack([math.sqrt(each) * rows, prior]), each)

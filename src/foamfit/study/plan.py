@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -37,6 +38,7 @@ from foamfit.study.gain import (
     Target,
     covariance,
     expected,
+    information,
     look,
     problem_for,
     rows_of,
@@ -219,22 +221,25 @@ def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Kno
     names = tuple(name for name in first.free() if name not in NUISANCE)
     k, share = len(names), dict[str, list[float]]()
     sizes, reached, missed = first.sizes(names, tests[0].values), np.zeros(k, dtype=bool), 0.0
-    breads, meats = np.zeros((2, len(tests), k, k))
+    roots = np.ones((len(tests), k))
     for t, one in enumerate(tests):
         best, objective = BestPoint(one.problem, one.values), one.problem.objective
-        rows = without_nuisance(rows_of(one.problem, one.values, names, sizes), k)
-        breads[t], root = rows.T @ rows, np.ones(k)
         reached |= np.array([name not in best.unreached for name in names])
-        if one.fit is not None:  # a simulated test has neither noise nor model error
-            missed += tolerance(best) / (ALIKE**2 - 1.0)
-            for curve, error in zip(objective.counted, best.errors, strict=True):
-                share.setdefault(curve, []).append(error.law / max(objective.span(curve), 1e-300))
-            for name, found in zip(best.names, best.spread.inflation.tolist(), strict=True):
-                if name in names and math.isfinite(found):
-                    root[names.index(name)] = math.sqrt(found)
-        # So that the covariance of this test alone is that of its fit, D (JᵀJ)⁻¹ D.
-        alone = np.linalg.pinv(breads[t], rcond=1e-12, hermitian=True) * np.outer(root, root)
-        meats[t] = breads[t] @ alone @ breads[t]
+        if one.fit is None:  # a simulated test has neither noise nor model error
+            continue
+        missed += tolerance(best) / (ALIKE**2 - 1.0)
+        for curve, error in zip(objective.counted, best.errors, strict=True):
+            share.setdefault(curve, []).append(error.law / max(objective.span(curve), 1e-300))
+        for name, found in zip(best.names, best.spread.inflation.tolist(), strict=True):
+            if name in names and math.isfinite(found):
+                roots[t, names.index(name)] = math.sqrt(found)
+
+    def said(t: int, values: Array) -> tuple[Array, Array]:
+        rows = rows_of(tests[t].problem, values, names, sizes)
+        return information(without_nuisance(rows, k), roots[t])
+
+    found_by = [said(t, one.values) for t, one in enumerate(tests)]
+    breads, meats = (np.array(each) for each in zip(*found_by, strict=True))
     values, places = tests[0].values, [first.index[name] for name in names]
     if len(tests) > 1:  # the mean, weighted by the information
         pull = [b @ (one.values[places] / sizes) for b, one in zip(breads, tests, strict=True)]
@@ -242,12 +247,21 @@ def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Kno
         values[places] = sizes * (np.linalg.pinv(breads.sum(axis=0), rcond=1e-10) @ sum(pull))
         values = first.space().decode(first.space().encode(values))
     means = {curve: float(np.mean(each)) for curve, each in share.items()}
-    both = breads.sum(axis=0), meats.sum(axis=0)
+    both = breads.sum(axis=0)[None], meats.sum(axis=0)[None]
     known = Known(
         first, values, names, sizes, *both, missed, means, np.ones(k), reached, values[None]
     )
     known = replace(known, stretch=_stretch(known, tests))
-    return replace(known, draws=_draws(known, tests, rng, draws)) if draws else known
+    if not draws:
+        return known
+    drawn, springs = _draws(known, tests, rng, draws), len(first.model.names)
+    bread, meat = np.repeat(known.bread, draws, axis=0), np.repeat(known.meat, draws, axis=0)
+    for i, one in enumerate(drawn):
+        with suppress(SimulationError):  # a coarser simulation had followed the test
+            own = [said(t, np.append(one[:springs], test.values[springs:]))
+                   for t, test in enumerate(tests)]  # fmt: skip
+            bread[i], meat[i] = np.sum(own, axis=0)
+    return replace(known, draws=drawn, bread=bread, meat=meat)
 
 
 def _stretch(known: Known, tests: Sequence[Test]) -> Array:
@@ -276,8 +290,8 @@ def _draws(known: Known, tests: Sequence[Test], rng: np.random.Generator, count:
     measured = any(one.fit is not None for one in tests)
     open_ = at[np.logical_not(known.reached) & measured]
     allowed, prior = (ALIKE**2 - 1.0) * known.missed, np.eye(k) / NOTHING**2
-    inverse = np.linalg.inv(known.bread + prior)
-    spread = inverse @ (known.meat + prior) @ inverse + allowed / 1.96**2 * inverse
+    inverse = np.linalg.inv(known.bread[0] + prior)
+    spread = inverse @ (known.meat[0] + prior) @ inverse + allowed / 1.96**2 * inverse
     power, axes = np.linalg.eigh(spread)
     axes = np.where(known.reached[:, None], axes * np.sqrt(np.maximum(power, 0.0)), 0.0)
     best = space.encode(known.values)  # steps are taken in the coordinates of the search
@@ -289,7 +303,7 @@ def _draws(known: Known, tests: Sequence[Test], rng: np.random.Generator, count:
         own = [np.append(values[:n_springs], one.values[n_springs:]) for one in tests]
         return sum(float(np.sum(o.residual(v) ** 2)) for o, v in zip(thin, own, strict=True))
 
-    noise = float(np.max(np.diag(known.meat) / np.maximum(np.diag(known.bread), 1e-300)))
+    noise = float(np.max(np.diag(known.meat[0]) / np.maximum(np.diag(known.bread[0]), 1e-300)))
     most = cost(known.values) + allowed + max(noise, 1.0) * float(stats.chi2.ppf(0.99, k))
     out = np.repeat(known.values[None], count, axis=0)
     for i in range(count):
@@ -382,7 +396,7 @@ def _beyond(known: Known, left: Sequence[str], rig: Rig, *, impacts: bool) -> di
     """Return, for parameters that no test of the rig determines, what other rig would."""
     problem, out = known.problem, dict.fromkeys(left, "")
     test, springs = problem.measurement, len(problem.model.kinds)
-    few = replace(known, draws=known.draws[: DRAWS // 4])
+    few = known.first(DRAWS // 4)
     for what, other in beyond(rig, springs) if left else ():
         made = [one for one in candidates(other, test, springs) if not one.repeat]
         made = [one for one in made if impacts or one.drive != "impact"]
