@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -134,54 +134,6 @@ def scale_in_words(name: str, value: float, scale: float) -> str:
     return f"{share} of {SCALES_IN_WORDS[param.scale]}"
 
 
-class Tied(Protocol):
-    """Parameters of a vector that depend on the others."""
-
-    def complete(self, values: Array) -> Array:
-        """Set them in a vector of parameters, in place."""
-
-    def follow(self, values: Array, moves: Array, steps: Array) -> Array:
-        """Return moves (n_values, m) of all parameters, completed by theirs."""
-
-
-@dataclass(frozen=True)
-class LastHeight:
-    """The last height of a chain, which is the rest of the specimen's."""
-
-    total: float  # m
-    first: int  # place of the first height
-    place: int  # of the last
-
-    def complete(self, values: Array) -> Array:
-        """Set the last height, in place."""
-        values[self.place] = self.total - values[self.first : self.place].sum()
-        return values
-
-    def follow(self, values: Array, moves: Array, steps: Array) -> Array:
-        """Complete the moves by that of the last height."""
-        moves[self.place] = -moves[self.first : self.place].sum(axis=0)
-        return moves
-
-
-@dataclass(frozen=True, eq=False)
-class Expressions:
-    """Parameters given by expressions of the user."""
-
-    evaluate: Callable[[Array], Array]
-
-    def complete(self, values: Array) -> Array:
-        """Set the parameters, in place."""
-        return self.evaluate(values)
-
-    def follow(self, values: Array, moves: Array, steps: Array) -> Array:
-        """Complete the moves by central differences of the expressions."""
-        out = np.empty_like(moves)
-        for j, step in enumerate(steps):
-            ahead = self.evaluate(values + step * moves[:, j])
-            out[:, j] = (ahead - self.evaluate(values - step * moves[:, j])) / (2.0 * step)
-        return np.where(moves != 0.0, moves, out)  # independent parameters keep exact moves
-
-
 # Order of the coordinates that all springs have; they follow those of the law.
 COMMON_ORDER = ("g", "tau", "eta", "height")
 
@@ -231,7 +183,8 @@ class Space:
     free: tuple[str, ...]  # Names of the parameters that vary
     low: Array  # (n,): Lower limit of every parameter, SI
     high: Array  # (n,): Upper limit of every parameter, SI
-    tied: Tied | None  # the parameters that depend on others through expressions
+    # Sets the parameters that depend on others through expressions, in place; None without any
+    tied: Callable[[Array], Array] | None
     # Parameters whose coordinate is their SI value, so that several tests can share it. Not every
     # point of the box is admissible then.
     absolute: tuple[str, ...] = ()
@@ -328,7 +281,7 @@ class Space:
 
     def complete(self, values: Array) -> Array:
         """Set the parameters of a vector that depend on others through expressions."""
-        return values if self.tied is None else self.tied.complete(values)
+        return values if self.tied is None else self.tied(values)
 
     def slopes(self, point: Array, values: Array) -> Array:
         """Return the derivative of the parameters by the coordinates, (n_values, n_free).
@@ -356,6 +309,12 @@ class Space:
     def follow(self, values: Array, moves: Array, steps: Array) -> Array:
         """Complete moves (n_values, m) of the parameters by those of dependent parameters.
 
-        `steps` (m,) are those of difference quotients; nothing is simulated.
+        They are central differences of the expressions with `steps` (m,); nothing is simulated.
         """
-        return moves if self.tied is None else self.tied.follow(values, moves, steps)
+        if self.tied is None:
+            return moves
+        out = np.empty_like(moves)
+        for j, step in enumerate(steps):
+            ahead = self.tied(values + step * moves[:, j])
+            out[:, j] = (ahead - self.tied(values - step * moves[:, j])) / (2.0 * step)
+        return np.where(moves != 0.0, moves, out)  # independent parameters keep exact moves

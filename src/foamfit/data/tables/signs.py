@@ -54,9 +54,9 @@ def negative_channels(channels: Mapping[str, Array], time: Array | None) -> tupl
     upright |= {c: -upright[c] for c in wrong}
     for channel, values in upright.items():
         other = force if channel in FORCES else motion
-        compared = other and channel not in (other, "velocity")
-        if compared and _opposite(values, upright[other]):
-            wrong.append(channel)
+        if other and channel not in (other, "velocity"):
+            opposite = np.dot(values - values.mean(), upright[other] - upright[other].mean()) < 0.0
+            wrong += [channel] * bool(opposite)
     if time is not None and "velocity" in upright and _against(upright, motion, time[kept]):
         wrong.append("velocity")
     return wrong, True
@@ -132,7 +132,7 @@ def _pulse_is_negative(force: Array) -> bool:
 
     Pulses are parts in which the force differs from its level at the start.
     """
-    level = _from_start(force)
+    level = force - np.median(force[: max(5, force.size // 200)])
     size = float(np.dot(level, level)) / max(float(np.abs(level).sum()), 1e-300)
     sides = np.sign(level) * (np.abs(level) > max(_PULSE * size, _NOISE * noise_level(force)))
     starts = np.append(0, np.flatnonzero(np.diff(sides)) + 1)
@@ -147,15 +147,6 @@ def _falls(motion: Array) -> bool:
     low = int(np.argmin(motion))
     fallen, risen = motion[0] - motion[low], motion[: low + 1].max() - motion[0]
     return bool(low < 0.98 * motion.size and fallen > max(2 * risen, 0.3 * np.ptp(motion)))
-
-
-def _opposite(values: Array, other: Array) -> bool:
-    """Return whether a channel changes against another one."""
-    return bool(np.dot(values - values.mean(), other - other.mean()) < 0.0)
-
-
-def _from_start(force: Array) -> Array:
-    return force - np.median(force[: max(5, force.size // 200)])
 
 
 def _against(channels: Mapping[str, Array], motion: str, time: Array) -> bool:

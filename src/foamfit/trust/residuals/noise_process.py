@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import orth
+from scipy.linalg import matmul_toeplitz, orth
 
 from foamfit.arrays import Array
 
@@ -64,18 +64,7 @@ class NoiseProcess:
         """Multiply the covariance matrix of n samples by the columns of an (n, k) array."""
         if not self.coefficients.size:
             return self.variance * columns
-        n = len(columns)
-        lags = self.autocovariance(n)
-        # Embed the covariance in a circulant matrix, which the Fourier transform diagonalises.
-        circulant = np.fft.rfft(np.concatenate([lags, [0.0], lags[:0:-1]]))
-        product: Array = np.fft.irfft(
-            np.fft.rfft(columns, 2 * n, axis=0) * circulant[:, None], axis=0
-        )
-        return product[:n]
-
-    def forms(self, columns: Array) -> Array:
-        """Return the variance lᵀΣl along each column l of `columns`, (n, k)."""
-        return np.asarray(np.einsum("ij,ij->j", columns, self.times(columns)))
+        return np.asarray(matmul_toeplitz(self.autocovariance(len(columns)), columns))
 
 
 def levinson(lags: Array) -> list[tuple[Array, float]]:
