@@ -8,7 +8,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.contact import ELSEWHERE, Levels, Start
-from foamfit.data.measurement import GRAVITY, NoiseLevel, Record, Striker
+from foamfit.data.measurement import GRAVITY, UNITS, NoiseLevel, Record, Striker
 from foamfit.data.noise import (
     MIN_REST,
     NOTHING,
@@ -109,7 +109,7 @@ def take_zeros(
             continue
         noise, zero, note = levels[name], NOTHING, ""
         if name in ("stress", "acceleration"):
-            unit = "Pa" if name == "stress" else "m/s²"
+            unit = UNITS[name]
             tail = tail_level(values, noise) if impact and n < _FEW else None
             if tail is not None and tail.samples > n:
                 zero = tail
