@@ -28,15 +28,14 @@ class Links:
     """The links between the parameters of n tests.
 
     `kinds` gives one of `KINDS` for each named parameter; all others are own. `log_rates` (n,) are
-    ln(rate/rate0), needed for rate laws, and `rate_errors` (n,) their standard errors (None if the
-    rates are exact). `pulls` (n,) of a scattering parameter are the square roots of the weights of
-    (ln v - ln common value)²; parameters without an entry have no such term.
+    ln(rate/rate0), needed for rate laws. `pulls` (n,) of a scattering parameter are the square
+    roots of the weights of (ln v - ln common value)²; parameters without an entry have no such
+    term.
     """
 
     kinds: Mapping[str, str]
     log_rates: Array | None = None
     pulls: Mapping[str, Array] = field(default_factory=dict)
-    rate_errors: Array | None = None
 
     def kind(self, name: str) -> str:
         """Return the kind of a parameter."""
@@ -52,11 +51,9 @@ class Links:
 
     def of(self, tests: list[int]) -> Links:
         """Return the links of a subset of the tests."""
-        rates, errors = self.log_rates, self.rate_errors
         return replace(
             self,
-            log_rates=None if rates is None else rates[tests],
-            rate_errors=None if errors is None else errors[tests],
+            log_rates=None if self.log_rates is None else self.log_rates[tests],
             pulls={name: pull[tests] for name, pull in self.pulls.items()},
         )
 
