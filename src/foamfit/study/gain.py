@@ -98,7 +98,7 @@ def without_nuisance(rows: Array, k: int) -> Array:
 def problem_for(known: Known, candidate: Candidate, rig: Rig) -> Problem:
     """Return the problem of a candidate with the law of the tests at hand."""
     problem, test = known.problem, known.problem.measurement
-    lasts, peak = 0.0, float(np.max(problem.objective.stress))
+    lasts, peak = 0.0, problem.scales.stress
     impact = candidate.drive == "impact"
     if impact:
         lasts, peak = _duration_and_peak(known, candidate, peak)
