@@ -58,13 +58,13 @@ class Links:
         )
 
 
-def factor(kind: str, b: float, x: float) -> tuple[float, float, float]:
-    """Return value over common value at x = ln(rate/rate0), and its first two derivatives by b."""
+def factor(kind: str, b: float, x: float) -> tuple[float, float]:
+    """Return value over common value at x = ln(rate/rate0), and its derivative by b."""
     if kind == POWER_RATE:
         value = float(np.exp(b * x))
-        return value, x * value, x * x * value
+        return value, x * value
     value = 1.0 + b * x
-    return (value, x, 0.0) if value > LEAST_FACTOR else (LEAST_FACTOR, 0.0, 0.0)
+    return (value, x) if value > LEAST_FACTOR else (LEAST_FACTOR, 0.0)
 
 
 def law_values(kind: str, v: float, b: float, x: Array) -> Array:

@@ -255,28 +255,24 @@ class JointPoint:
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """Uncertainty of all unknowns due to noise."""
-        bend = np.zeros((self._scales.size,) * 2)
-        blocks = tuple(self._block(t, bend) for t in range(len(self.bests)))
-        return Uncertainty(blocks, self._scales, self._drawn(), bend)
+        blocks = tuple(map(self._block, range(len(self.bests))))
+        return Uncertainty(blocks, self._scales, self._drawn())
 
-    def _block(self, t: int, bend: Array) -> Block:
-        """Return the block of a test, and add the curvature of its rate laws to `bend`."""
+    def _block(self, t: int) -> Block:
+        """Return the block of a test."""
         best, links, scales = self.bests[t], self.found.links, self._scales
         block = best.block(self.errors[t] if self.errors else ())
         through = np.zeros((len(best.names), scales.size))
-        room, pull = np.array(block.room), block.jacobian.T @ block.residual
+        room = np.array(block.room)
         for i, name in enumerate(best.names):
             kind, at = links.kind(name), self._own[t].get(name)
             if at is not None:
                 through[i, at] = 1.0
             elif kind in RATES:
                 at, (v, b) = self.names.index(name), self.found.common[name]
-                f, slope, second = factor(kind, b, links.x(t))
+                f, slope = factor(kind, b, links.x(t))
                 two = slice(at, at + 2)
                 through[i, two] = np.array([f, v * slope]) * scales[two] / best.sizes[i]
-                bends = np.array([[0.0, slope], [slope, v * second]])
-                bends *= np.outer(scales[two], scales[two])
-                bend[two, two] += pull[i] / best.sizes[i] * bends
             else:
                 at = self.names.index(name)
                 through[i, at] = scales[at] / best.sizes[i]
