@@ -39,10 +39,15 @@ def negative_channels(channels: Mapping[str, Array], time: Array | None) -> tupl
     The channels have the same rows, but any zero and unit. If force and motion contradict each
     other and the record does not show which of them is wrong, both are returned.
     """
+    from scipy.ndimage import median_filter
+
     force, motion = (next((c for c in names if c in channels), "") for names in (FORCES, MOTIONS))
     inner = [inner_samples(channels[c]) for c in (force or motion or "velocity", motion) if c]
     kept = slice(max(part.start for part in inner), min(part.stop for part in inner))
-    upright = {c: _smoothed(values[kept]) for c, values in channels.items()}
+    upright = {c: values[kept] for c, values in channels.items()}
+    least, width = _SMOOTHED
+    if kept.stop - kept.start >= least:  # a running median removes single spikes
+        upright = {c: median_filter(v, width, mode="nearest") for c, v in upright.items()}
     if force and motion:
         signs = _signs(upright[force], upright[motion])
         if signs is None:
@@ -60,14 +65,6 @@ def negative_channels(channels: Mapping[str, Array], time: Array | None) -> tupl
     if time is not None and "velocity" in upright and _against(upright, motion, time[kept]):
         wrong.append("velocity")
     return wrong, True
-
-
-def _smoothed(values: Array) -> Array:
-    """Return a running median, which removes single spikes."""
-    from scipy.ndimage import median_filter
-
-    least, width = _SMOOTHED
-    return median_filter(values, width, mode="nearest") if values.size >= least else values
 
 
 def _signs(force: Array, motion: Array) -> tuple[int, int] | None:

@@ -153,14 +153,10 @@ def _corrected(
     return replace(process, coefficients=coefficients, variance=float(lags[0]))
 
 
-def _radius(coefficients: Array) -> float:
-    """Return the largest decay factor per sample of the modes of an autoregression."""
-    return float(np.max(np.abs(np.roots(np.append(1.0, -coefficients))), initial=0.0))
-
-
 def _damped(coefficients: Array, n: int) -> Array:
     """Limit the decay times of the modes of an autoregression to a quarter of n samples."""
-    share = min(1.0, (1.0 - 4.0 / n) / max(_radius(coefficients), 1e-300))
+    decays = np.abs(np.roots(np.append(1.0, -coefficients)))  # of the modes, per sample
+    share = min(1.0, (1.0 - 4.0 / n) / max(float(np.max(decays, initial=0.0)), 1e-300))
     return np.asarray(coefficients * share ** np.arange(1, coefficients.size + 1))
 
 
