@@ -46,6 +46,7 @@ from foamfit.trust.covariance import AT_LIMIT
 from foamfit.trust.intervals import Announce, Choice, assess, evaluations_of
 from foamfit.trust.ranges import Open, left_open
 from foamfit.trust.settle import (
+    back_to_plain,
     descend_again,
     follow_samples,
     held_by_record,
@@ -310,6 +311,7 @@ def _assess(
                 return best, record, replace(made, ranges=left.ranges)
             tracker.consider(made.better)
             refine(problem, tracker)
+            back_to_plain(problem, tracker)
         except SearchStoppedError:
             return found.best(), record, Intervals()
         best = found.best()
