@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from conftest import HEIGHT, synthetic_loop
-from foamfit.data.cycles import loading_rate, rate_error
+from foamfit.data.cycles import loading_rate
 from foamfit.data.noise import with_noise
 
 _, LOOP = synthetic_loop(noise=0.0)
@@ -30,18 +30,6 @@ def test_noise_about_a_flat_peak_does_not_move_it():
     rates = [loading_rate(moved(time, strain + 2e-3 * rng.standard_normal(301))) for _ in range(50)]
     assert np.mean(rates) == pytest.approx(800.0, rel=0.02)
     assert np.std(rates) < 8.0
-
-
-@pytest.mark.parametrize("level", [3e-4, 3e-3])
-def test_the_error_of_a_rate_is_the_scatter_of_rates_under_the_noise(level):
-    time, rng = np.linspace(0.0, 8.0, 201), np.random.default_rng(1)
-    strain = np.interp(time, [0.0, 4.0, 8.0], [0.0, 0.5, 0.0])
-    tests = [moved(time, strain + level * rng.standard_normal(201)) for _ in range(60)]
-    scatter = np.std(np.log([loading_rate(test) for test in tests]), ddof=1)
-    told = [rate_error(test) for test in tests[:20]]
-    assert 0.8 * scatter < np.mean(told) < 1.5 * scatter  # its copies have the noise twice
-    assert told[0] == rate_error(tests[0])  # repeatable
-    assert rate_error(moved(time, strain)) < 0.1 * scatter
 
 
 def test_a_hold_at_the_largest_strain_is_no_loading():

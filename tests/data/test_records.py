@@ -10,9 +10,10 @@ import fabricated
 from conftest import refused, run
 from foamfit.data.calibration import contradictions
 from foamfit.data.csv_file import read_test
-from foamfit.data.energy import audit, describe
+from foamfit.data.energy import audit
 from foamfit.errors import InputError
 from foamfit.fitting.curves import check_drive
+from foamfit.report.described import describe
 from foamfit.report.summary import render_report, summary_text
 
 SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'

@@ -74,30 +74,6 @@ def test_the_covariance_is_the_sandwich_of_all_residuals(point):
     )
 
 
-@pytest.mark.parametrize("kind", ["log rate", "power rate"])
-def test_the_error_of_a_rate_is_in_that_of_the_slope(kind):
-    """The added variance agrees with refits in which the rate of each test is shifted."""
-    problems, vectors = loops_of([{"k0": SPRING.k0 * (1.0 + 0.03 * x)} for x in X], 2e4)
-    kinds = dict.fromkeys(problems[0].free(), "shared") | {"s1_k0": kind}
-    errors, step = np.array([0.0, 0.03, 0.06]), 1e-3
-    found = fit_linked(problems, Links(kinds, X, rate_errors=errors), [vectors])
-    sure = replace(found, links=replace(found.links, rate_errors=None))
-    with_rates, without = (JointPoint(one, errors_of(one)) for one in (found, sure))
-    moved = np.array([
-        np.subtract(*(
-            fit_linked(
-                problems, Links(kinds, X + sign * step * np.eye(3)[t]), [found.values],
-            ).common["s1_k0"]
-            for sign in (1.0, -1.0)
-        )) / (2.0 * step)
-        for t in range(3)
-    ])  # fmt: skip
-    for j, name in enumerate(("s1_k0", "s1_k0:b")):
-        more = with_rates.of_common(name)[0] ** 2 - without.of_common(name)[0] ** 2
-        assert more == pytest.approx(np.sum((moved[:, j] * errors) ** 2), rel=0.1)
-    assert with_rates.of_common("s1_k0:b")[0] > 1.15 * without.of_common("s1_k0:b")[0]
-
-
 def test_one_test_alone_has_the_covariance_of_its_own_fit():
     problems, vectors = loops_of([{}], 2e4)
     kinds = dict.fromkeys(problems[0].free(), "shared")

@@ -25,7 +25,8 @@ def check(test: Path, specimen: Path | None) -> None:
         foamfit check TEST.csv --specimen foam.toml
     """
     from foamfit.data.csv_file import read_test
-    from foamfit.data.energy import audit, describe
+    from foamfit.data.energy import audit
+    from foamfit.report.described import describe
 
     measurement = read_test(test, specimen)
     say(describe(measurement, audit(measurement)))

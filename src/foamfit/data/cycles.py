@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,9 +31,7 @@ _BEGUN = 3.0  # multiple of the least load above which the first rise has certai
 # Rate
 _AT_PEAK = 3.0  # samples within this many standard deviations below the largest may be the peak
 _CLOSE = 0.95  # share of the peak; a motion is held if it takes longer from there than up to there
-_COPIES = 30  # number of copies with additional noise
 _FINE = 20  # points per sample of a fitted motion
-_NORMAL = 0.6745  # median magnitude of a standard normal variable
 
 
 @dataclass(frozen=True)
@@ -343,24 +340,6 @@ def loading_rate(test: Measurement, fitted: Array | None = None) -> float | None
         time, motion, sigma = fine, CubicSpline(time, fitted)(fine), 0.0
     velocity = _velocity(time, motion, sigma)
     return None if velocity is None else velocity / test.specimen.height
-
-
-def rate_error(test: Measurement) -> float:
-    """Return the standard error of the logarithm of the rate due to noise of the displacement.
-
-    It is the scatter over copies of the record with added noise of the same size. Estimated noise
-    is limited to the deviation of samples from a parabola through their neighbours.
-    """
-    w, level = test.displacement, test.noise.of("displacement")
-    sigma = level.sigma if level else 0.0
-    if test.time is None or w is None or w.size < 5 or sigma <= 0.0:
-        return 0.0
-    third = float(np.median(np.abs(np.diff(w, 3)))) / (_NORMAL * math.sqrt(20.0))
-    scatter = min(sigma, third) if test.noise.displacement is None else sigma
-    noise = scatter * np.random.default_rng(0).standard_normal((_COPIES, w.size))
-    copies = [_velocity(test.time - test.time[0], w + added, sigma) for added in noise]
-    rates = [rate for rate in copies if rate is not None]
-    return float(np.std(np.log(rates), ddof=1)) if len(rates) > 1 else 0.0
 
 
 def _velocity(time: Array, motion: Array, sigma: float) -> float | None:

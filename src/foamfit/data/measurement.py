@@ -19,6 +19,8 @@ ASKED = "Check:"  # starts a note about a probable error in the input
 
 # Sources of a displacement; an integrated one is not an independent measurement.
 MEASURED, INTEGRATED = "measured", "integrated from force"
+# SI units of the channels other than displacements, which are in m.
+UNITS = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}
 
 
 def interior_channel(node: int) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from foamfit.arrays import Array, Integers, Mask
-from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Outliers, Record
+from foamfit.data.measurement import MIN_ROWS, UNITS, NoiseLevel, Outliers, Record
 from foamfit.data.noise import estimated_noise, noise_level, quantum, robust_variance
 from foamfit.text import counted, engineering, percent
 
@@ -248,11 +248,10 @@ def notes_on(record: Record, spikes: dict[str, int], found: dict[str, Outliers])
         if outliers is None or not outliers.at.size:
             notes.append(f"{note} were bridged, none of them in the part that is used.")
             continue
-        unit = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}.get(name, "m")
         shown, used = list[str](), outliers.at.size
         for at, value in zip(outliers.at[:4], outliers.values[:4], strict=True):
             where = f"sample {at:.0f}" if record.time is None else engineering(at, "s")
-            shown.append(f"{engineering(value, unit)} at {where}")
+            shown.append(f"{engineering(value, UNITS.get(name, 'm'))} at {where}")
         more = f" and {used - 4} more" if used > 4 else ""
         part = "" if used == count else f", {used} of them in the part that is used"
         notes.append(f"{note} are not fitted{part}: {', '.join(shown)}{more}.")

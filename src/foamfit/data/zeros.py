@@ -8,7 +8,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.contact import ELSEWHERE, Levels, Start
-from foamfit.data.measurement import GRAVITY, NoiseLevel, Record, Striker
+from foamfit.data.measurement import GRAVITY, UNITS, NoiseLevel, Record, Striker
 from foamfit.data.noise import (
     MIN_REST,
     NOTHING,
@@ -16,7 +16,6 @@ from foamfit.data.noise import (
     level_on_line,
     line_at,
     mean_level,
-    noise_about,
     smooth,
 )
 from foamfit.text import engineering, percent
@@ -25,6 +24,7 @@ _LEAST_LEAD = 8  # least number of rows kept before contact
 _FEWEST = 3  # least number of rows for a zero
 _FEW = 20  # with fewer rows before contact, a flat end of the record gives a better zero
 _TAIL = 0.04  # share of a record taken as its end
+_FLAT = 3.5  # most slope of a flat end, in standard errors
 _HIGHEST = 0.1  # highest level of the end, as a share of the range
 _DRIFTS = 0.005  # share of its range by which a stress that drifts changes at least
 _MATTERS = 0.01  # relative gain of velocity in a fall above which gravity must be specified
@@ -79,7 +79,8 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
     if np.argmax(values) > len(values) - 2 * size:
         return None
     level = mean_level(values[-n:], noise)
-    if _falls(values[-n:], level):
+    slope = level_on_line(np.arange(n, dtype=np.float64), values[-n:], 0.0, noise)[1]
+    if abs(slope.value) > _FLAT * slope.error:
         return None
     while n + step < len(values) // 2:
         more = mean_level(values[-n - step : -n], noise)
@@ -92,18 +93,6 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
     if level.samples < MIN_REST:
         level = level._replace(error=max(level.error, noise.sigma))
     return level if abs(level.value) < _HIGHEST * float(np.ptp(values)) else None
-
-
-def _falls(tail: Array, level: Level) -> bool:
-    """Return whether the end of a record still changes: its halves differ significantly.
-
-    The scatter is that about a line: a mean takes the fall of a soft end of contact for scatter.
-    """
-    n, error = tail.size, level.error
-    if n >= MIN_REST:
-        scatter, time = noise_about(tail, 1)
-        error = scatter * float(np.sqrt(time / n))
-    return bool(abs(tail[: n // 2].mean() - tail[n // 2 :].mean()) > 3.0 * 2.0 * error)
 
 
 def take_zeros(
@@ -120,7 +109,7 @@ def take_zeros(
             continue
         noise, zero, note = levels[name], NOTHING, ""
         if name in ("stress", "acceleration"):
-            unit = "Pa" if name == "stress" else "m/s²"
+            unit = UNITS[name]
             tail = tail_level(values, noise) if impact and n < _FEW else None
             if tail is not None and tail.samples > n:
                 zero = tail

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -134,54 +134,6 @@ def scale_in_words(name: str, value: float, scale: float) -> str:
     return f"{share} of {SCALES_IN_WORDS[param.scale]}"
 
 
-class Tied(Protocol):
-    """Parameters of a vector that depend on the others."""
-
-    def complete(self, values: Array) -> Array:
-        """Set them in a vector of parameters, in place."""
-
-    def follow(self, values: Array, moves: Array, steps: Array) -> Array:
-        """Return moves (n_values, m) of all parameters, completed by theirs."""
-
-
-@dataclass(frozen=True)
-class LastHeight:
-    """The last height of a chain, which is the rest of the specimen's."""
-
-    total: float  # m
-    first: int  # place of the first height
-    place: int  # of the last
-
-    def complete(self, values: Array) -> Array:
-        """Set the last height, in place."""
-        values[self.place] = self.total - values[self.first : self.place].sum()
-        return values
-
-    def follow(self, values: Array, moves: Array, steps: Array) -> Array:
-        """Complete the moves by that of the last height."""
-        moves[self.place] = -moves[self.first : self.place].sum(axis=0)
-        return moves
-
-
-@dataclass(frozen=True, eq=False)
-class Expressions:
-    """Parameters given by expressions of the user."""
-
-    evaluate: Callable[[Array], Array]
-
-    def complete(self, values: Array) -> Array:
-        """Set the parameters, in place."""
-        return self.evaluate(values)
-
-    def follow(self, values: Array, moves: Array, steps: Array) -> Array:
-        """Complete the moves by central differences of the expressions."""
-        out = np.empty_like(moves)
-        for j, step in enumerate(steps):
-            ahead = self.evaluate(values + step * moves[:, j])
-            out[:, j] = (ahead - self.evaluate(values - step * moves[:, j])) / (2.0 * step)
-        return np.where(moves != 0.0, moves, out)  # independent parameters keep exact moves
-
-
 # Order of the coordinates that all springs have; they follow those of the law.
 COMMON_ORDER = ("g", "tau", "eta", "height")
 
@@ -197,27 +149,24 @@ class Coordinate(NamedTuple):
     short: str
     param: Param | None  # None for nuisance parameters and absolute coordinates
     limits: tuple[float, float]
+    bounds: tuple[float, float]  # of the parameter, SI
     ends: tuple[float, float] | Between
     of: tuple[int, ...] = ()
+    is_logarithmic: bool = False
 
-    @property
-    def is_logarithmic(self) -> bool:
-        """Whether the coordinate is the logarithm of the parameter."""
-        return self.param is not None and self.param.is_logarithmic
-
-    def ends_at(self, values: Array) -> tuple[float, float]:
+    def ends_at(self, values: Array | list[float]) -> tuple[float, float]:
         """Return the values of the parameter at the coordinates 0 and 1 (if not logarithmic)."""
         if isinstance(self.ends, Between):
-            return self.ends.ends(*[values.item(place) for place in self.of])
+            return self.ends.ends(*[float(values[place]) for place in self.of])
         return self.ends
 
-    def value(self, u: float, values: Array) -> float:
+    def value(self, u: float, values: Array | list[float]) -> float:
         """Return the parameter at coordinate `u`, ignoring its limits.
 
         `values` must contain the parameters that its ends depend on.
         """
         first, last = self.ends_at(values)
-        return float(np.exp(u)) * last if self.is_logarithmic else first + u * (last - first)
+        return math.exp(u) * last if self.is_logarithmic else first + u * (last - first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +180,8 @@ class Space:
     free: tuple[str, ...]  # Names of the parameters that vary
     low: Array  # (n,): Lower limit of every parameter, SI
     high: Array  # (n,): Upper limit of every parameter, SI
-    tied: Tied | None  # the parameters that depend on others through expressions
+    # Sets the parameters that depend on others through expressions, in place; None without any
+    tied: Callable[[Array], Array] | None
     # Parameters whose coordinate is their SI value, so that several tests can share it. Not every
     # point of the box is admissible then.
     absolute: tuple[str, ...] = ()
@@ -244,16 +194,18 @@ class Space:
             at = index[name]
             low, high = float(self.low[at]), float(self.high[at])
             if name in self.absolute:
-                out.append(Coordinate(at, name, None, (low, high), (0.0, 1.0)))
+                out.append(Coordinate(at, name, None, (low, high), (low, high), (0.0, 1.0)))
             elif name in NUISANCE:
-                out.append(Coordinate(at, name, None, NUISANCE_BOX, (0.5 * (low + high), high)))
+                ends = 0.5 * (low + high), high
+                out.append(Coordinate(at, name, None, NUISANCE_BOX, (low, high), ends))
             else:
                 param, prefix = self.model.param(name), name.partition("_")[0]
                 of = tuple(index[f"{prefix}_{short}"] for short in param.of)
                 ends = 0.0, self.scales.unit(param.scale)
                 between = param.coordinate if isinstance(param.coordinate, Between) else ends
                 short = split_name(name)[1]
-                out.append(Coordinate(at, short, param, param.limits, between, of))
+                log, bounds = param.is_logarithmic, (low, high)
+                out.append(Coordinate(at, short, param, param.limits, bounds, between, of, log))
         return out
 
     def _rank(self, name: str) -> int:
@@ -264,23 +216,6 @@ class Space:
             return own.index(short)
         rest = (*COMMON_ORDER, *NUISANCE)
         return 1000 + rest.index(family(short))
-
-    @cached_property
-    def _fixed_ends(self) -> tuple[Any, ...]:
-        """Coordinates with constant ends: columns, indices, both ends, which are logarithms."""
-        coordinates = enumerate(self.coordinates)
-        own = [(j, one) for j, one in coordinates if not isinstance(one.ends, Between)]
-        ends = np.array([one.ends for _, one in own])
-        columns = np.array([j for j, _ in own], dtype=np.intp)
-        places = np.array([one.place for _, one in own], dtype=np.intp)
-        by_log = np.flatnonzero([one.is_logarithmic for _, one in own])
-        return columns, places, *np.reshape(ends, (-1, 2)).T, by_log
-
-    @cached_property
-    def _between(self) -> list[tuple[int, Coordinate]]:
-        """Coordinates whose ends depend on other parameters, with their columns."""
-        coordinates = enumerate(self.coordinates)
-        return [(j, one) for j, one in coordinates if isinstance(one.ends, Between)]
 
     @cached_property
     def box(self) -> tuple[Array, Array]:
@@ -304,16 +239,11 @@ class Space:
 
     def decode(self, point: Array) -> Array:
         """Return the vector of parameters (SI) at a point of the box."""
-        values, (columns, places, first, last, by_log) = self.values.copy(), self._fixed_ends
-        u = point[columns]
-        found = first + u * (last - first)
-        found[by_log] = np.exp(u[by_log]) * last[by_log]
-        values[places] = np.minimum(np.maximum(found, self.low[places]), self.high[places])
-        for j, one in self._between:
-            start, end = one.ends_at(values)
-            at, value = one.place, start + point.item(j) * (end - start)
-            values[at] = min(max(value, self.low.item(at)), self.high.item(at))
-        return self.complete(values)
+        values = self.values.tolist()
+        for one, u in zip(self.coordinates, point.tolist(), strict=True):
+            low, high = one.bounds
+            values[one.place] = min(max(one.value(u, values), low), high)
+        return self.complete(np.array(values))
 
     def admit(self, values: Array, held: Collection[int] = ()) -> Array:
         """Move dependent parameters between their ends, in place, and complete the vector.
@@ -328,34 +258,37 @@ class Space:
 
     def complete(self, values: Array) -> Array:
         """Set the parameters of a vector that depend on others through expressions."""
-        return values if self.tied is None else self.tied.complete(values)
+        return values if self.tied is None else self.tied(values)
 
     def slopes(self, point: Array, values: Array) -> Array:
         """Return the derivative of the parameters by the coordinates, (n_values, n_free).
 
         `values` is the decoded `point`.
         """
-        moves = np.zeros((values.size, point.size))
-        columns, places, first, last, by_log = self._fixed_ends
-        found = last - first
-        found[by_log] = values[places[by_log]]
-        value = first + point[columns] * (last - first)
-        value[by_log] = values[places[by_log]]
-        inside = (self.low[places] <= value) & (value <= self.high[places])
-        moves[places, columns] = np.where(inside, found, 0.0)
-        for j, one in self._between:
-            by = one.ends.slopes(*(values.item(place) for place in one.of))  # type: ignore[union-attr]
-            for place, (first_by, last_by) in zip(one.of, by, strict=True):
-                moves[one.place] += (first_by + point[j] * (last_by - first_by)) * moves[place]
-            start, end = one.ends_at(values)
-            moves[one.place, j] = end - start
-            if not self.low[one.place] <= start + point[j] * (end - start) <= self.high[one.place]:
-                moves[one.place] = 0.0
+        moves, own = np.zeros((values.size, point.size)), values.tolist()
+        for j, (one, u) in enumerate(zip(self.coordinates, point.tolist(), strict=True)):
+            at, (first, last), (low, high) = one.place, one.ends_at(own), one.bounds
+            if one.is_logarithmic:
+                moves[at, j] = own[at]
+                continue
+            if isinstance(one.ends, Between):
+                by = one.ends.slopes(*(own[place] for place in one.of))
+                for place, (first_by, last_by) in zip(one.of, by, strict=True):
+                    moves[at] += (first_by + u * (last_by - first_by)) * moves[place]
+            moves[at, j] = last - first
+            if not low <= first + u * (last - first) <= high:
+                moves[at] = 0.0
         return self.follow(values, moves, np.full(point.size, 1e-5))
 
     def follow(self, values: Array, moves: Array, steps: Array) -> Array:
         """Complete moves (n_values, m) of the parameters by those of dependent parameters.
 
-        `steps` (m,) are those of difference quotients; nothing is simulated.
+        They are central differences of the expressions with `steps` (m,); nothing is simulated.
         """
-        return moves if self.tied is None else self.tied.follow(values, moves, steps)
+        if self.tied is None:
+            return moves
+        out = np.empty_like(moves)
+        for j, step in enumerate(steps):
+            ahead = self.tied(values + step * moves[:, j])
+            out[:, j] = (ahead - self.tied(values - step * moves[:, j])) / (2.0 * step)
+        return np.where(moves != 0.0, moves, out)  # independent parameters keep exact moves

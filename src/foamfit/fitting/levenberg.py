@@ -72,17 +72,15 @@ def damped_step(gradient: Array, normal: Array, damping: float, held: NDArray[np
 
     `damping` multiplies the diagonal of the normal matrix.
     """
-    if held.any() or not held.size:
-        step, moving = np.zeros(gradient.size), np.flatnonzero(~held)
-        if moving.size:
-            own = normal[np.ix_(moving, moving)]
-            step[moving] = damped_step(gradient[moving], own, damping, held[moving])
+    step, moving = np.zeros(gradient.size), np.flatnonzero(~held)
+    if not moving.size:
         return step
-    own = normal.copy()
-    diagonal = own.ravel()[:: gradient.size + 1]  # a view
+    own, slope = normal[moving[:, None], moving], gradient[moving]
+    diagonal = own.ravel()[:: moving.size + 1]  # a view
     diagonal += damping * np.maximum(diagonal, 1e-12 * max(float(diagonal.sum()), 1e-300))
-    _, found, failed = dposv(own, -gradient)
-    return np.asarray(np.linalg.solve(own, -gradient) if failed else found)
+    _, found, failed = dposv(own, -slope)
+    step[moving] = np.linalg.solve(own, -slope) if failed else found
+    return step
 
 
 def following(at: Iterate, shift: Array, held: NDArray[np.bool_]) -> list[Array]:

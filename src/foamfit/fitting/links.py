@@ -28,15 +28,14 @@ class Links:
     """The links between the parameters of n tests.
 
     `kinds` gives one of `KINDS` for each named parameter; all others are own. `log_rates` (n,) are
-    ln(rate/rate0), needed for rate laws, and `rate_errors` (n,) their standard errors (None if the
-    rates are exact). `pulls` (n,) of a scattering parameter are the square roots of the weights of
-    (ln v - ln common value)²; parameters without an entry have no such term.
+    ln(rate/rate0), needed for rate laws. `pulls` (n,) of a scattering parameter are the square
+    roots of the weights of (ln v - ln common value)²; parameters without an entry have no such
+    term.
     """
 
     kinds: Mapping[str, str]
     log_rates: Array | None = None
     pulls: Mapping[str, Array] = field(default_factory=dict)
-    rate_errors: Array | None = None
 
     def kind(self, name: str) -> str:
         """Return the kind of a parameter."""
@@ -52,22 +51,20 @@ class Links:
 
     def of(self, tests: list[int]) -> Links:
         """Return the links of a subset of the tests."""
-        rates, errors = self.log_rates, self.rate_errors
         return replace(
             self,
-            log_rates=None if rates is None else rates[tests],
-            rate_errors=None if errors is None else errors[tests],
+            log_rates=None if self.log_rates is None else self.log_rates[tests],
             pulls={name: pull[tests] for name, pull in self.pulls.items()},
         )
 
 
-def factor(kind: str, b: float, x: float) -> tuple[float, float, float]:
-    """Return value over common value at x = ln(rate/rate0), and its first two derivatives by b."""
+def factor(kind: str, b: float, x: float) -> tuple[float, float]:
+    """Return value over common value at x = ln(rate/rate0), and its derivative by b."""
     if kind == POWER_RATE:
         value = float(np.exp(b * x))
-        return value, x * value, x * x * value
+        return value, x * value
     value = 1.0 + b * x
-    return (value, x, 0.0) if value > LEAST_FACTOR else (LEAST_FACTOR, 0.0, 0.0)
+    return (value, x) if value > LEAST_FACTOR else (LEAST_FACTOR, 0.0)
 
 
 def law_values(kind: str, v: float, b: float, x: Array) -> Array:

@@ -132,8 +132,8 @@ class Objective:
             name: level.sigma if (level := self.noise(name)).given else max(level.sigma, floor)
             for name, floor in least.items()
         }
-        self._kept = {name: self._fitted(name) for name in self.measured}
-        self.sizes = tuple(self.kept(name).size for name in self.counted)
+        self._kept = {name: self._samples(name) for name in self.measured}
+        self.sizes = tuple(self._kept[name].size for name in self.counted)
         self.n_data = sum(self.sizes)
         self.penalty = max(PENALTY * self.span(name) for name in self.counted)
         self._set_targets()
@@ -183,12 +183,6 @@ class Objective:
         """Whether the measured motion drives the springs."""
         return self.scenes.driven
 
-    @property
-    def stress(self) -> Array:
-        """Measured stress, Pa."""
-        assert self.measurement.stress is not None  # checked by check_drive
-        return self.measurement.stress
-
     def weigh_motion(self, values: Array) -> bool:
         """Weight the residuals by the uncertainty of the driving motion; False if it has none.
 
@@ -234,16 +228,14 @@ class Objective:
 
     def _measured(self) -> dict[str, Array]:
         """Return the measured curves that the drive does not prescribe."""
-        measured = {"stress_time": self.stress}
-        if self.measurement.displacement is not None:
-            measured["displacement_time"] = self.measurement.displacement
-            measured["stress_strain"] = self.stress
-        inside = self.measurement.interior
-        measured |= {name: inside[node] for name, node in self.interior.items()}
-        if self._accelerated:
-            assert self.measurement.acceleration is not None
-            measured[ACCELERATION] = self.measurement.acceleration
-        return {name: curve for name, curve in measured.items() if name in self.scenes.present}
+        test = self.measurement
+        measured = {"stress_time": test.stress}
+        if test.displacement is not None:
+            measured |= {"displacement_time": test.displacement, "stress_strain": test.stress}
+        measured |= {name: test.interior[node] for name, node in self.interior.items()}
+        measured |= {ACCELERATION: test.acceleration} if self._accelerated else {}
+        present = self.scenes.present
+        return {n: curve for n, curve in measured.items() if n in present and curve is not None}
 
     def noise(self, name: str) -> NoiseLevel:
         """Return the noise of a curve, stated or estimated."""
@@ -251,7 +243,7 @@ class Objective:
         assert level is not None  # completed by with_noise
         return level
 
-    def _fitted(self, name: str) -> NDArray[np.intp]:
+    def _samples(self, name: str) -> NDArray[np.intp]:
         """Return the indices of the samples that count: measured ones without outliers."""
         channel = channel_of(name)
         counts = self.measurement.sampled.get(channel, np.ones(self.time.size, dtype=bool))

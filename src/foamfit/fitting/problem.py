@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -16,7 +16,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.data.units import LARGEST, parse_uncertain
 from foamfit.errors import InputError
 from foamfit.fitting import nuisance
-from foamfit.fitting.box import Expressions, LastHeight, Scales, Space, Tied, others
+from foamfit.fitting.box import Scales, Space, others
 from foamfit.fitting.curves import (
     check_interior,
     choose_drive,
@@ -285,18 +285,18 @@ class Problem:
             params[name].set(value=one.mean, vary=False)
         return replace(self, params=params, kept=free)
 
-    def tied(self) -> Tied | None:
-        """Return the parameters that depend on others through expressions; None without any."""
+    def tied(self) -> Callable[[Array], Array] | None:
+        """Return a function that sets the parameters given by expressions; None without any."""
         tied = [name for name in self.names if self.params[name].expr is not None]
-        if not tied:
-            return None
-        rest = _rest_of_height(self.measurement, self.model)
-        if [self.params[name].expr for name in tied] == [rest]:
-            first, last = self.model.index["s1_height"], len(self.model.kinds) - 1
-            return LastHeight(self.measurement.specimen.height, first, first + last)
         places, scratch = [self.index[name] for name in tied], self.params.copy()
+        total, first = self.measurement.specimen.height, self.index.get("s1_height", 0)
+        last = first + len(self.model.kinds) - 1
 
-        def complete(values: Array) -> Array:
+        def rest(values: Array) -> Array:
+            values[last] = total - values[first:last].sum()
+            return values
+
+        def evaluated(values: Array) -> Array:
             for name in self.free():
                 scratch[name].value = values[self.index[name]]
             scratch.update_constraints()
@@ -304,7 +304,10 @@ class Problem:
                 values[place] = scratch[name].value
             return values
 
-        return Expressions(complete)
+        expressions = [self.params[name].expr for name in tied]
+        if expressions == [_rest_of_height(self.measurement, self.model)]:  # faster than lmfit
+            return rest
+        return evaluated if tied else None
 
     def space(self) -> Space:
         """Return the box of the search."""

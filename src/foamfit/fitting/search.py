@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.data.measurement import Measurement
 from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
 from foamfit.fitting.nuisance import TIME_SHIFT
@@ -375,9 +374,14 @@ def _search_loop(
     Start values read off the loop are added to `points`. The best point of the loop is passed to
     the tracker even if the search is stopped.
     """
-    objective = tracker.objective
-    loop = _loop_of(objective)
-    along = _along(objective, loop)
+    objective, followed = tracker.objective, None
+    if _is_noisy(objective) and objective.motion is not None:
+        followed = objective.motion.at(objective.time)
+    loop = thinned(objective.measurement, followed, loop=True)
+    along = Objective(
+        loop, objective.model, "displacement", {"stress_strain": 1.0},
+        time_shift=objective.time_shift, nuisance=objective.nuisance, spent=objective.spent,
+    )  # fmt: skip
     inner = Tracker(along, tracker.deadline, tracker.better)
     own = space
     if objective.drive == "impact":  # contact and zeros do not affect its loop
@@ -400,22 +404,6 @@ def _search_loop(
         if inner.best_values is not None:
             tracker.consider(inner.best_values)
     return ends
-
-
-def _loop_of(objective: Objective) -> Measurement:
-    """Return the smooth loop of a test, off which start values are read."""
-    followed = None
-    if _is_noisy(objective) and objective.motion is not None:
-        followed = objective.motion.at(objective.time)
-    return thinned(objective.measurement, followed, loop=True)
-
-
-def _along(objective: Objective, loop: Measurement) -> Objective:
-    """Return the objective of the stress along the motion of a loop."""
-    return Objective(
-        loop, objective.model, "displacement", {"stress_strain": 1.0},
-        time_shift=objective.time_shift, nuisance=objective.nuisance, spent=objective.spent,
-    )  # fmt: skip
 
 
 def _is_noisy(objective: Objective) -> bool:

@@ -46,7 +46,7 @@ class Rate:
 
     def value(self, v: float, b: float) -> tuple[float, float, float]:
         """Return the coordinate and its derivatives by the coordinate v at rate0 and by b."""
-        f, slope, _ = factor(self.kind, b, self.x)
+        f, slope = factor(self.kind, b, self.x)
         if self.logarithmic:
             return v + float(np.log(f)), 1.0, slope / f
         return v * f, f, v * slope

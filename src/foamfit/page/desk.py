@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import tomli_w
 
 from foamfit.data.csv_file import read_test
-from foamfit.data.energy import audit, describe
+from foamfit.data.energy import audit
 from foamfit.data.measurement import Measurement
 from foamfit.data.tables.columns import Source
 from foamfit.data.tables.csv_table import read_text
@@ -31,6 +31,7 @@ from foamfit.data.toml_file import toml_beside
 from foamfit.errors import InputError
 from foamfit.page.worker import Job, Worker, parsed
 from foamfit.report import figures
+from foamfit.report.described import describe
 from foamfit.report.panels import Line, Panel, draw
 from foamfit.text import listed
 

@@ -114,7 +114,7 @@ def information(rows: Array, root: Array) -> tuple[Array, Array]:
 def problem_for(known: Known, candidate: Candidate, rig: Rig) -> Problem:
     """Return the problem of a candidate with the law of the tests at hand."""
     problem, test = known.problem, known.problem.measurement
-    lasts, peak = 0.0, float(np.max(problem.objective.stress))
+    lasts, peak = 0.0, problem.scales.stress
     impact = candidate.drive == "impact"
     if impact:
         lasts, peak = _duration_and_peak(known, candidate, peak)

@@ -14,7 +14,7 @@ import numpy as np
 
 from foamfit.arrays import Array, single_threaded
 from foamfit.data.csv_file import read_test
-from foamfit.data.cycles import loading_rate, rate_error
+from foamfit.data.cycles import loading_rate
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, naming
 from foamfit.fitting.curves import choose_drive
@@ -54,7 +54,6 @@ class _Test:
     problem: Problem
     params: lmfit.Parameters  # Before any fit
     rate: float | None  # 1/s
-    rate_error: float = 0.0  # Standard error of the logarithm of the rate
 
 
 @single_threaded
@@ -144,8 +143,7 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
     tests = list[_Test]()
     for (name, path, test), params in zip(found, all_params, strict=True):
         problem = options.problem(test, study.model, params)
-        rate, sigma = loading_rate(test), rate_error(problem.measurement)
-        tests.append(_Test(name, path, problem, params, rate, sigma))
+        tests.append(_Test(name, path, problem, params, loading_rate(test)))
     return tests, refused
 
 
@@ -204,11 +202,7 @@ def _links(study: Study, tests: Sequence[_Test]) -> Links:
     middle = _median_rate(rates)
     if middle is None:
         return Links(study.kinds)
-    return Links(
-        study.kinds,
-        np.log([(rate or middle) / middle for rate in rates]),
-        rate_errors=np.array([test.rate_error for test in tests]),
-    )
+    return Links(study.kinds, np.log([(rate or middle) / middle for rate in rates]))
 
 
 def _median_rate(rates: Sequence[float | None]) -> float | None:
@@ -261,10 +255,10 @@ def _own_fits(
     for t, fitted in sorted(found.items()):
         problem, test = fitted.problem, replace(tests[t], problem=fitted.problem)
         if problem.objective.drive == "impact" and test.rate is not None:
-            # The rate of the fitted motion: the fit's errors already include its error.
+            # The rate of the fitted motion, which has no noise.
             simulated = problem.objective.simulate(fitted.values, everything=True)
             rate = loading_rate(problem.measurement, simulated.curves["displacement_time"])
-            test = replace(test, rate=rate, rate_error=0.0)
+            test = replace(test, rate=rate)
         kept.append(test)
     vectors = [fitted.values for _, fitted in sorted(found.items())]
     return kept, Together.of_own_fits([test.problem for test in kept], vectors)

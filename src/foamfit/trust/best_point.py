@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
 from foamfit.fitting.branches import unreached
-from foamfit.fitting.links import LOG_RATE, RATES, factor
+from foamfit.fitting.links import RATES, factor
 from foamfit.fitting.nuisance import CONTACT_TIME
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
@@ -255,42 +255,29 @@ class JointPoint:
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """Uncertainty of all unknowns due to noise."""
-        bend = np.zeros((self._scales.size,) * 2)
-        blocks = tuple(self._block(t, bend) for t in range(len(self.bests)))
-        return Uncertainty(blocks, self._scales, self._drawn(), bend)
+        blocks = tuple(map(self._block, range(len(self.bests))))
+        return Uncertainty(blocks, self._scales, self._drawn())
 
-    def _block(self, t: int, bend: Array) -> Block:
-        """Return the block of a test, and add the curvature of its rate laws to `bend`."""
+    def _block(self, t: int) -> Block:
+        """Return the block of a test."""
         best, links, scales = self.bests[t], self.found.links, self._scales
         block = best.block(self.errors[t] if self.errors else ())
         through = np.zeros((len(best.names), scales.size))
-        given, room = np.zeros(len(best.names)), np.array(block.room)
-        pull = block.jacobian.T @ block.residual
+        room = np.array(block.room)
         for i, name in enumerate(best.names):
             kind, at = links.kind(name), self._own[t].get(name)
             if at is not None:
                 through[i, at] = 1.0
             elif kind in RATES:
                 at, (v, b) = self.names.index(name), self.found.common[name]
-                f, slope, second = factor(kind, b, links.x(t))
+                f, slope = factor(kind, b, links.x(t))
                 two = slice(at, at + 2)
                 through[i, two] = np.array([f, v * slope]) * scales[two] / best.sizes[i]
-                bends = np.array([[0.0, slope], [slope, v * second]])
-                bends *= np.outer(scales[two], scales[two])
-                bend[two, two] += pull[i] / best.sizes[i] * bends
-                if links.rate_errors is not None:
-                    given[i] = b * v * (1.0 if kind == LOG_RATE else f) / best.sizes[i]
-                    given[i] *= links.rate_errors[t]
             else:
                 at = self.names.index(name)
                 through[i, at] = scales[at] / best.sizes[i]
             if kind not in ("own", "shared"):
                 room[i] = np.inf
-        if given.any():
-            column = (block.jacobian @ given)[:, None]
-            block = replace(
-                block, shifts=np.hstack([s for s in (block.shifts, column) if s is not None])
-            )
         return replace(block, through=through, room=room)
 
     def _drawn(self) -> tuple[Array, Array] | None:

@@ -21,7 +21,6 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import SimulationError
 from foamfit.fitting import nuisance
 from foamfit.fitting.curves import later
-from foamfit.fitting.objective import Objective
 from foamfit.parts import ParameterEstimate
 from foamfit.results import SOURCES, Budget
 from foamfit.springs.parameters import NUISANCE
@@ -106,14 +105,10 @@ def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array
                 values[best.index[name]] *= 1.0 + share
     elif quantity in best.index:
         values[best.index[quantity]] *= 1.0 + share
-    objective = on_test(problem.objective, test)
+    before = problem.objective
+    same = test.displacement is before.measurement.displacement  # not to be smoothed again
+    objective = replace(before, measurement=test, followed=(before.motion,) if same else ())
     return values, objective.compare(objective.simulate(values), values)
-
-
-def on_test(objective: Objective, test: Measurement) -> Objective:
-    """Return the objective for a changed test; the same motion is not smoothed again."""
-    same = test.displacement is objective.measurement.displacement
-    return replace(objective, measurement=test, followed=(objective.motion,) if same else ())
 
 
 def changed(test: Measurement, quantity: str, share: float) -> Measurement:

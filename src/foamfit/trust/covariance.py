@@ -157,16 +157,15 @@ class Uncertainty:
 
     The scaled covariance is H⁻¹ JᵀΣJ H⁻¹, with Σ the noise covariance of the curves of all tests.
     H is JᵀJ or, with `curvatures` (of each test, along its `Block.axes`), the Hessian of half the
-    cost, which differs from JᵀJ if there is model error (White 1982, Econometrica 50, 1). `bend`
-    (m, m) is the contribution to H of the nonlinearity of `Block.through`. `drawn` contains the
-    derivatives (d, m) and variances (d,) of additional residuals. All is computed along s
-    directions of the unknowns, along which the residuals of all tests together have unit slopes.
+    cost, which differs from JᵀJ if there is model error (White 1982, Econometrica 50, 1). `drawn`
+    contains the derivatives (d, m) and variances (d,) of additional residuals. All is computed
+    along s directions of the unknowns, along which the residuals of all tests together have unit
+    slopes.
     """
 
     blocks: tuple[Block, ...]
     scales: Array  # (m,)
     drawn: tuple[Array, Array] | None = None
-    bend: Array | None = None
     curvatures: tuple[Array, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -202,7 +201,6 @@ class Uncertainty:
         pairs = zip(self.lefts, self.curvatures, strict=False)
         more = np.concatenate([(curved - np.eye(len(curved))) @ left for left, curved in pairs])
         out += self._left[: len(more)].T @ more
-        out += 0.0 if self.bend is None else self.root.T @ self.bend @ self.root
         values, vectors = np.linalg.eigh(0.5 * (out + out.T))
         return np.asarray((vectors / np.where(values > FLATTEST, values, 1.0)) @ vectors.T)
 
@@ -247,7 +245,6 @@ class Uncertainty:
                 tuple(block.without(self.held) for block in self.blocks),
                 self.scales[free],
                 None if self.drawn is None else (self.drawn[0][:, free], self.drawn[1]),
-                None if self.bend is None else self.bend[np.ix_(free, free)],
             )
         spreads = [left @ reduced.axes for left in reduced.lefts]
         pairs = zip(reduced.blocks, spreads, strict=False)

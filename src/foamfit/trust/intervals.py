@@ -190,10 +190,10 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
     of their residuals.
     """
     if best.misfits:
-        apart, objective = (residual - best.residual)[:, None], best.problem.objective
+        apart, objective = residual - best.residual, best.problem.objective
         pairs = zip(best.spread.noise, objective.by_curve(apart).values(), strict=True)
         spread = float(np.sum(apart[objective.n_data :] ** 2))  # of priors, of unit variance
-        spread += sum(float(process.forms(own)[0]) for process, own in pairs)
+        spread += sum(float(own @ process.times(own)) for process, own in pairs)
         near = float(residual @ residual) - best.cost <= 1.96 * 2.0 * math.sqrt(spread)
         return best.halves if near else np.full(best.halves.shape, np.nan)
     left = 1.0 - best.rises(residual) / best.quantiles**2

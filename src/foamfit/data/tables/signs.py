@@ -39,10 +39,15 @@ def negative_channels(channels: Mapping[str, Array], time: Array | None) -> tupl
     The channels have the same rows, but any zero and unit. If force and motion contradict each
     other and the record does not show which of them is wrong, both are returned.
     """
+    from scipy.ndimage import median_filter
+
     force, motion = (next((c for c in names if c in channels), "") for names in (FORCES, MOTIONS))
     inner = [inner_samples(channels[c]) for c in (force or motion or "velocity", motion) if c]
     kept = slice(max(part.start for part in inner), min(part.stop for part in inner))
-    upright = {c: _smoothed(values[kept]) for c, values in channels.items()}
+    upright = {c: values[kept] for c, values in channels.items()}
+    least, width = _SMOOTHED
+    if kept.stop - kept.start >= least:  # a running median removes single spikes
+        upright = {c: median_filter(v, width, mode="nearest") for c, v in upright.items()}
     if force and motion:
         signs = _signs(upright[force], upright[motion])
         if signs is None:
@@ -54,20 +59,12 @@ def negative_channels(channels: Mapping[str, Array], time: Array | None) -> tupl
     upright |= {c: -upright[c] for c in wrong}
     for channel, values in upright.items():
         other = force if channel in FORCES else motion
-        compared = other and channel not in (other, "velocity")
-        if compared and _opposite(values, upright[other]):
-            wrong.append(channel)
+        if other and channel not in (other, "velocity"):
+            opposite = np.dot(values - values.mean(), upright[other] - upright[other].mean()) < 0.0
+            wrong += [channel] * bool(opposite)
     if time is not None and "velocity" in upright and _against(upright, motion, time[kept]):
         wrong.append("velocity")
     return wrong, True
-
-
-def _smoothed(values: Array) -> Array:
-    """Return a running median, which removes single spikes."""
-    from scipy.ndimage import median_filter
-
-    least, width = _SMOOTHED
-    return median_filter(values, width, mode="nearest") if values.size >= least else values
 
 
 def _signs(force: Array, motion: Array) -> tuple[int, int] | None:
@@ -132,7 +129,7 @@ def _pulse_is_negative(force: Array) -> bool:
 
     Pulses are parts in which the force differs from its level at the start.
     """
-    level = _from_start(force)
+    level = force - np.median(force[: max(5, force.size // 200)])
     size = float(np.dot(level, level)) / max(float(np.abs(level).sum()), 1e-300)
     sides = np.sign(level) * (np.abs(level) > max(_PULSE * size, _NOISE * noise_level(force)))
     starts = np.append(0, np.flatnonzero(np.diff(sides)) + 1)
@@ -147,15 +144,6 @@ def _falls(motion: Array) -> bool:
     low = int(np.argmin(motion))
     fallen, risen = motion[0] - motion[low], motion[: low + 1].max() - motion[0]
     return bool(low < 0.98 * motion.size and fallen > max(2 * risen, 0.3 * np.ptp(motion)))
-
-
-def _opposite(values: Array, other: Array) -> bool:
-    """Return whether a channel changes against another one."""
-    return bool(np.dot(values - values.mean(), other - other.mean()) < 0.0)
-
-
-def _from_start(force: Array) -> Array:
-    return force - np.median(force[: max(5, force.size // 200)])
 
 
 def _against(channels: Mapping[str, Array], motion: str, time: Array) -> bool:

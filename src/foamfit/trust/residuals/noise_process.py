@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import orth
+from scipy.linalg import matmul_toeplitz, orth
 
 from foamfit.arrays import Array
 
@@ -64,18 +64,7 @@ class NoiseProcess:
         """Multiply the covariance matrix of n samples by the columns of an (n, k) array."""
         if not self.coefficients.size:
             return self.variance * columns
-        n = len(columns)
-        lags = self.autocovariance(n)
-        # Embed the covariance in a circulant matrix, which the Fourier transform diagonalises.
-        circulant = np.fft.rfft(np.concatenate([lags, [0.0], lags[:0:-1]]))
-        product: Array = np.fft.irfft(
-            np.fft.rfft(columns, 2 * n, axis=0) * circulant[:, None], axis=0
-        )
-        return product[:n]
-
-    def forms(self, columns: Array) -> Array:
-        """Return the variance lᵀΣl along each column l of `columns`, (n, k)."""
-        return np.asarray(np.einsum("ij,ij->j", columns, self.times(columns)))
+        return np.asarray(matmul_toeplitz(self.autocovariance(len(columns)), columns))
 
 
 def levinson(lags: Array) -> list[tuple[Array, float]]:
@@ -164,14 +153,10 @@ def _corrected(
     return replace(process, coefficients=coefficients, variance=float(lags[0]))
 
 
-def _radius(coefficients: Array) -> float:
-    """Return the largest decay factor per sample of the modes of an autoregression."""
-    return float(np.max(np.abs(np.roots(np.append(1.0, -coefficients))), initial=0.0))
-
-
 def _damped(coefficients: Array, n: int) -> Array:
     """Limit the decay times of the modes of an autoregression to a quarter of n samples."""
-    share = min(1.0, (1.0 - 4.0 / n) / max(_radius(coefficients), 1e-300))
+    decays = np.abs(np.roots(np.append(1.0, -coefficients)))  # of the modes, per sample
+    share = min(1.0, (1.0 - 4.0 / n) / max(float(np.max(decays, initial=0.0)), 1e-300))
     return np.asarray(coefficients * share ** np.arange(1, coefficients.size + 1))
 
 
