@@ -37,3 +37,11 @@ def test_a_hold_at_the_largest_strain_is_no_loading():
     strain = np.interp(time, [0.0, 2.0, 20.0, 30.0], [0.0, 0.5, 0.5, 0.0])
     noisy = strain + 1e-4 * np.random.default_rng(0).standard_normal(time.size)
     assert loading_rate(moved(time, noisy)) == pytest.approx(0.25, rel=0.02)
+
+
+def test_the_rate_of_several_cycles_is_that_of_the_first():
+    """The largest sample may be in any cycle."""
+    time = np.linspace(0.0, 4.2, 1201)
+    strain = np.interp(time, [0.0, 2.0, 2.4, 3.8, 4.2], [0.0, 0.5, 0.0, 0.502, 0.0])
+    noisy = strain + 1e-4 * np.random.default_rng(0).standard_normal(time.size)
+    assert loading_rate(moved(time, noisy)) == pytest.approx(0.25, rel=0.02)

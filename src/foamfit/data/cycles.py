@@ -348,6 +348,11 @@ def _velocity(time: Array, motion: Array, sigma: float) -> float | None:
     most = float(motion.max())
     if most <= 0.0 or time[np.argmax(motion)] <= 0.0:
         return None
+    near = int(np.argmax(motion >= _CLOSE * most))
+    below = np.flatnonzero(motion[near:] < 0.5 * most)
+    if below.size:  # the peak is that of the first cycle
+        time, motion = time[: near + below[0]], motion[: near + below[0]]
+        most = float(motion.max())
     when = float(np.mean(time[motion >= most - _AT_PEAK * sigma]))
     reached = float(time[np.argmax(motion >= _CLOSE * most)]) / _CLOSE
     return most / (reached if when > 2.0 * reached > 0.0 else when)
