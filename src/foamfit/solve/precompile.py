@@ -17,7 +17,7 @@ import numpy as np
 from foamfit.errors import SimulationError
 from foamfit.solve import cache
 
-LOOPS = ("follow", "integrate")  # `integrate` needs what the second process compiles
+LOOPS = ("follow", "integrate")
 SECOND = "from foamfit.solve.precompile import compile_second; compile_second()"
 LONGEST = 300.0  # s that the second process may take
 
@@ -77,20 +77,17 @@ def _second_process() -> Iterator[None]:
 
 def compile_solver(model: str = "bistable", announce: Callable[[], None] | None = None) -> None:
     """Announce and compile what a fit of a model needs, unless it is in the cache."""
-    missing = [loop for loop in LOOPS if not cache.compiled(loop)]
-    if not missing:
+    if all(map(cache.compiled, LOOPS)):
         return
     (announce or (lambda: cache.warn("the solver")))()
     model = model if model != "auto" else "bistable+microscale"
     cache.LOG.disabled = True  # it has been said that the solver is compiled
     gc.disable()  # a fifth of the time
     try:
-        if "integrate" in missing:
-            with _second_process():
-                compile_first()
-                run("follow", model)
-        for loop in missing:
-            run(loop, model)
+        with _second_process():
+            compile_first()
+            run("follow", model)
+        run("integrate", model)  # it needs what the second process has compiled
     finally:
         gc.enable()
         cache.LOG.disabled = False
