@@ -49,9 +49,12 @@ def as_signalled() -> Iterator[None]:
     try:
         yield
     except SystemError as error:
-        first: BaseException | None = error
-        while isinstance(first, SystemError):  # one for each nested compiled loop
-            first = first.__cause__ or first.__context__
-        if first is None or isinstance(first, Exception):
-            raise
-        raise first from None
+        raise signalled(error) from None
+
+
+def signalled(error: SystemError) -> BaseException:
+    """Return the KeyboardInterrupt that Python has turned into a SystemError, or the error."""
+    first: BaseException | None = error
+    while isinstance(first, SystemError):  # one for each nested compiled loop
+        first = first.__cause__ or first.__context__
+    return error if first is None or isinstance(first, Exception) else first

@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
@@ -224,6 +225,29 @@ class Space:
         low, high = np.reshape(limits, (-1, 2)).T.copy()
         return low, high
 
+    @cached_property
+    def _plain(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_], Array, Array]:
+        """Coordinates whose ends are fixed: their numbers, places, and ways of transformation.
+
+        The value is first + step exp(u) if the coordinate is logarithmic, else first + step u.
+        """
+        plain = [(j, one) for j, one in enumerate(self.coordinates) if not one.of]
+        ends = np.reshape([one.ends_at([]) for _, one in plain], (-1, 2))
+        logs = np.array([one.is_logarithmic for _, one in plain], bool)
+        first = np.where(logs, 0.0, ends[:, 0])
+        numbers, places = [j for j, _ in plain], [one.place for _, one in plain]
+        return np.array(numbers, int), np.array(places, int), logs, first, ends[:, 1] - first
+
+    @cached_property
+    def _bounds(self) -> Array:
+        """Least and largest values of the parameters of `_plain`, (2, n), SI."""
+        return np.stack((self.low, self.high))[:, self._plain[1]]
+
+    @cached_property
+    def _dependent(self) -> list[tuple[int, Coordinate]]:
+        """Numbers of coordinates whose ends depend on other parameters, and these, in order."""
+        return [(j, one) for j, one in enumerate(self.coordinates) if one.of]
+
     def encode(self, values: Array) -> Array:
         """Return the coordinates of a vector of parameters, moved into the box."""
         out = np.empty(len(self.coordinates))
@@ -239,11 +263,16 @@ class Space:
 
     def decode(self, point: Array) -> Array:
         """Return the vector of parameters (SI) at a point of the box."""
-        values = self.values.tolist()
-        for one, u in zip(self.coordinates, point.tolist(), strict=True):
-            low, high = one.bounds
-            values[one.place] = min(max(one.value(u, values), low), high)
-        return self.complete(np.array(values))
+        values, (plain, places, logs, first, step) = self.values.copy(), self._plain
+        u = point[plain]
+        np.exp(u, out=u, where=logs)
+        low, high = self._bounds
+        values[places] = np.minimum(np.maximum(first + step * u, low), high)
+        own = values.tolist()
+        for j, one in self._dependent:
+            least, most = one.bounds
+            own[one.place] = min(max(one.value(point.item(j), own), least), most)
+        return self.complete(np.array(own))
 
     def admit(self, values: Array, held: Collection[int] = ()) -> Array:
         """Move dependent parameters between their ends, in place, and complete the vector.
@@ -266,17 +295,20 @@ class Space:
         `values` is the decoded `point`.
         """
         moves, own = np.zeros((values.size, point.size)), values.tolist()
-        for j, (one, u) in enumerate(zip(self.coordinates, point.tolist(), strict=True)):
-            at, (first, last), (low, high) = one.place, one.ends_at(own), one.bounds
-            if one.is_logarithmic:
-                moves[at, j] = own[at]
-                continue
-            if isinstance(one.ends, Between):
-                by = one.ends.slopes(*(own[place] for place in one.of))
-                for place, (first_by, last_by) in zip(one.of, by, strict=True):
-                    moves[at] += (first_by + u * (last_by - first_by)) * moves[place]
-            moves[at, j] = last - first
-            if not low <= first + u * (last - first) <= high:
+        plain, places, logs, first, step = self._plain
+        low, high = self._bounds
+        u = first + step * point[plain]
+        moves[places, plain] = np.where(logs, values[places], step * ((low <= u) & (u <= high)))
+        for j, one in self._dependent:
+            at, part, (begin, end), (least, most) = (
+                one.place, point.item(j), one.ends_at(own), one.bounds,
+            )  # fmt: skip
+            assert isinstance(one.ends, Between)
+            by = one.ends.slopes(*(own[place] for place in one.of))
+            for place, (first_by, last_by) in zip(one.of, by, strict=True):
+                moves[at] += (first_by + part * (last_by - first_by)) * moves[place]
+            moves[at, j] = end - begin
+            if not least <= begin + part * (end - begin) <= most:
                 moves[at] = 0.0
         return self.follow(values, moves, np.full(point.size, 1e-5))
 
@@ -287,8 +319,7 @@ class Space:
         """
         if self.tied is None:
             return moves
-        out = np.empty_like(moves)
-        for j, step in enumerate(steps):
-            ahead = self.tied(values + step * moves[:, j])
-            out[:, j] = (ahead - self.tied(values - step * moves[:, j])) / (2.0 * step)
+        way = steps * moves
+        ahead, behind = self.tied(values[:, None] + way), self.tied(values[:, None] - way)
+        out = (ahead - behind) / (2.0 * steps)
         return np.where(moves != 0.0, moves, out)  # independent parameters keep exact moves

@@ -18,7 +18,7 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import INTEGRATED, Measurement, NoiseLevel
 from foamfit.data.motion import SmoothMotion
 from foamfit.data.noise import with_noise
-from foamfit.errors import InputError, SimulationError, as_signalled
+from foamfit.errors import InputError, SimulationError, signalled
 from foamfit.fitting import nuisance as nuisances
 from foamfit.fitting.curves import (
     ACCELERATION,
@@ -260,11 +260,12 @@ class Objective:
         self.spent.evaluations += 1
         self.spent.sloped += places.size > 0
         try:
-            with as_signalled():
-                return self.scenes.rows(values, places, self.counted, everything)
+            return self.scenes.rows(values, places, self.counted, everything)
         except SimulationError:
             self.spent.failures += 1
             raise
+        except SystemError as error:
+            raise signalled(error) from None
         finally:
             self.spent.seconds += time.perf_counter() - began
 
@@ -322,7 +323,7 @@ class Objective:
     def _bounded(self, off: Array, values: Array) -> Array:
         """Return residuals within the penalty, weighed, with those of the priors."""
         # The stress may be huge near the pole of branch c.
-        bounded = np.clip(off, -self.penalty, self.penalty)
+        bounded = np.maximum(np.minimum(off, self.penalty), -self.penalty)
         bounded = bounded if self.weighing is None else self.weighing(bounded)
         return np.append(bounded, self.off_priors(values)) if self.priors else bounded
 

@@ -286,17 +286,26 @@ class Problem:
         return replace(self, params=params, kept=free)
 
     def tied(self) -> Callable[[Array], Array] | None:
-        """Return a function that sets the parameters given by expressions; None without any."""
+        """Return a function that sets the parameters given by expressions; None without any.
+
+        It takes a vector (n,), or one in each column (n, m).
+        """
         tied = [name for name in self.names if self.params[name].expr is not None]
-        places, scratch = [self.index[name] for name in tied], self.params.copy()
         total, first = self.measurement.specimen.height, self.index.get("s1_height", 0)
         last = first + len(self.model.kinds) - 1
 
         def rest(values: Array) -> Array:
-            values[last] = total - values[first:last].sum()
+            values[last] = total - values[first:last].sum(axis=0)
             return values
 
+        expressions = [self.params[name].expr for name in tied]
+        if expressions == [_rest_of_height(self.measurement, self.model)]:  # faster than lmfit
+            return rest
+        places, scratch = [self.index[name] for name in tied], self.params.copy()
+
         def evaluated(values: Array) -> Array:
+            if values.ndim > 1:
+                return np.column_stack([evaluated(one) for one in values.T])
             for name in self.free():
                 scratch[name].value = values[self.index[name]]
             scratch.update_constraints()
@@ -304,9 +313,6 @@ class Problem:
                 values[place] = scratch[name].value
             return values
 
-        expressions = [self.params[name].expr for name in tied]
-        if expressions == [_rest_of_height(self.measurement, self.model)]:  # faster than lmfit
-            return rest
         return evaluated if tied else None
 
     def space(self) -> Space:

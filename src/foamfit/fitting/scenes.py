@@ -284,10 +284,11 @@ class Scenes:
     ) -> tuple[dict[str, Array], Motion]:  # fmt: skip
         """Return the curves with derivatives by parameters of the springs."""
         height, drag = self.measurement.specimen.height, springs.item(-1)
-        rows, heights = self.model.rows(springs), self._one
+        rows, heights, fine = self.model.rows(springs), self._one, drag >= 0.0
         if len(self.model.kinds) > 1:
             heights = springs[-1 - len(self.model.kinds) : -1].copy()
-        if rows is None or not (heights.min() > 0.0 and drag >= 0.0):
+            fine = fine and heights.min() > 0.0
+        if rows is None or not fine:
             raise SimulationError("the parameters are not admissible")
         if self._largest - at.get("displacement_zero", 0.0) >= height:
             raise SimulationError("the measured strain would reach one with this displacement_zero")
@@ -362,7 +363,7 @@ class Scenes:
 
     def _sampled(self, values: Array) -> Array:
         """Return the mean over the instants that each sample averages, along the last axis."""
-        values = values if self._own is None else values[..., self._own]
+        values = values if self._own is None else values.take(self._own, axis=-1)
         if self._fine == 1:
             return values
         parts = [values[..., i :: self._fine] for i in range(self._fine)]  # faster than .mean()

@@ -155,12 +155,8 @@ def on_one_plateau(
     return np.where(marked, together[directions[:, 0]], 0.0)
 
 
-def switches(time: Array, history: Array) -> Array:
-    """Return the changes of branch between samples, at the later sample.
-
-    `history` (2, springs, n) are strains and branches.
-    """
-    strain, branches = history
+def switches(time: Array, strain: Array, branches: Array) -> Array:
+    """Return the changes of branch between samples, at the later sample; (springs, n) are given."""
     at, spring = np.nonzero(np.diff(branches, axis=1).T)
     left, entered = branches[spring, at], branches[spring, at + 1]
     return np.column_stack([time[at + 1], spring, left, entered, strain[spring, at + 1]])

@@ -52,7 +52,7 @@ LEAST_TOL, LEAST_OF_MASSES, LEAST_VIBRATING = 2e-14, 5e-13, 5e-12  # the last of
 # Outcomes of explicit steps after which implicit ones are tried.
 _STIFF = scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW
 LOGGED = 1024  # switches in the log of a first run; with more it is repeated
-AT_MOST = 1e-9  # error of an elongation over the height
+AT_MOST = 1e-9  # error of an elongation over the height, or over the largest elongation
 
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
 _NOTHING = np.zeros(1)
@@ -320,34 +320,30 @@ class Plan(NamedTuple):
         memory = self._layout(rows, damped, directions, integrated=False).memory()
         given = *memory, rows, heights
         if alone:
-            own = directions[:, 1].tolist()
-            strain = self.values / heights
+            own, strain = directions[:, 1].tolist(), self.values / heights
             samples = histories.at_samples(strain, MOVED in own)
             drive = self.mass, reals, strain, self.time
-            if cache.timed(along.follow, *given, *drive, out, NO_SWITCHES, samples):
+            outcome = cache.timed(along.follow, *given, *drive, out, NO_SWITCHES, samples)
+            if outcome == along.UNFIT:
                 return None
+            fine, history = outcome == scenes.DONE, (strain[None], samples[None, :, 2])
             out[0, 1], out[1:, 1] = self.values, 0.0
             dashpot = rows.item(0, 0), heights.item(0)
             histories.add_dashpot(out, self.time, strain, *dashpot, own, samples)
-            history = np.stack((strain, samples[:, 2]))[:, None]
         else:
             history = np.empty((2, count, n))
             drive = self.mass, reals, self.values, self.time
-            cache.timed(static.balance, *given, *drive, out, NO_SWITCHES, history)
-        fine = bool(np.isfinite(out[0]).all())
-        if fine and self.top == scenes.MOTION and not alone:
-            miss = np.abs(out[0, -1] - self.values).max()
-            fine = miss <= AT_MOST * (self.height + np.abs(self.values).max())
-            out[0, -1] = self.values
+            miss = cache.timed(static.balance, *given, *drive, out, NO_SWITCHES, history)
+            fine = miss <= AT_MOST * self.height or miss <= AT_MOST * np.abs(self.values).max()
         if not fine:
             loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
             raise scenes.failure(scenes.NOT_FINITE, self.top, self.values, loose)
         slopes = Slopes(out[1:, 1:], out[1:, 0]) if wanted else None
-        if slopes is not None and self.top == scenes.MOTION and count > 1:
+        if slopes is not None and everything and self.top == scenes.MOTION and count > 1:
             rows = rows[:, 1 + 2 * self.terms :]
             shared = histories.on_one_plateau(self.laws.made, rows, history[1], directions)
             slopes = slopes._replace(one_sided=shared)
-        switches = histories.switches(self.time, history) if everything else NO_SWITCHES
+        switches = histories.switches(self.time, *history) if everything else NO_SWITCHES
         return Motion(out[0, 1:], out[0, 0], math.nan, switches, 0, CLOSED_FORM, slopes)
 
     @property

@@ -14,7 +14,8 @@ import math
 from foamfit.solve.compiled.events import change_branch
 from foamfit.solve.compiled.motion import PART, call_inside, evaluate
 from foamfit.solve.compiled.run import RECORD, begin_run
-from foamfit.solve.compiled.samples import row_of
+from foamfit.solve.compiled.samples import is_finite, row_of
+from foamfit.solve.scene import DONE, NOT_FINITE
 from foamfit.springs.compiled.contract import (
     BY,
     BY_HELD,
@@ -38,9 +39,7 @@ from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATI
 OF_STEP, TABLE = 6, 8  # columns of the table of a relaxation term, which begins with moments
 LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the middle adds
 LEAST_FADE = 1e-6  # least step with internal variables that decay
-SAME, TOO_LONG, UNFIT = range(
-    3
-)  # how a step of `decay` ends: UNFIT if the law needs another solver
+SAME, TOO_LONG, UNFIT = range(3)  # ends of a step of `decay`; UNFIT if the law needs another solver
 #: record, strain, time until then, tolerance, derivatives by a shift of the motion, results
 FADING = WHOLE(WHOLES_AT, REAL, REAL, REAL, REALS_AT, REALS_AT)
 call_fade = calling(WHOLE, RECORD, REAL, REAL, REAL, REALS_AT, REALS_AT)
@@ -244,7 +243,8 @@ def follow(  # type: ignore[no-untyped-def]
     """Follow one spring, without its dashpot, along strains from rest.
 
     `samples` (n, 4) are derivatives by a shift of the motion, see `histories.at_samples`, then
-    branch and slope dσ/dε, which are filled. Return whether the law needs another solver.
+    branch and slope dσ/dε, which are filled. Return DONE, NOT_FINITE, or UNFIT if the law needs
+    another solver.
     """
     c = begin_run(ints, floats, time, strains, out, log, rows, heights, mass, reals)
     s, t, tol, n, weight, m = c.springs, c.time, reals[3], c.samples, 0.0, c.batch
@@ -268,5 +268,5 @@ def follow(  # type: ignore[no-untyped-def]
         if not m[0] < math.inf:
             for k in range(j, n):
                 out[0, 0, k], samples[k, 2] = math.inf, s.branch
-            return m[1] < 0.0
-    return False
+            return UNFIT if m[1] < 0.0 else NOT_FINITE + c.none
+    return (DONE if is_finite(c, 1) else NOT_FINITE) + c.none

@@ -31,7 +31,7 @@ from foamfit.solve.compiled.run import (
     spring,
     unpack,
 )
-from foamfit.solve.compiled.samples import approach, fly, write_inside
+from foamfit.solve.compiled.samples import approach, fly, is_finite, write_inside
 from foamfit.solve.scene import DONE, FLAT_UNDER_STRESS, NOT_FINITE, STEP_UNDERFLOW, TOO_MANY_STEPS
 from foamfit.springs.compiled.contract import (
     BY,
@@ -308,15 +308,6 @@ def _failure(c, how, most, gives_up):  # type: ignore[no-untyped-def]
     return c.none + (STEP_UNDERFLOW if how == FAILED else DONE)
 
 
-@inner
-def _is_finite(c):  # type: ignore[no-untyped-def]
-    """Whether all samples of the response are finite."""
-    out, fine = c.out, c.none
-    for k in range(c.shown * c.samples):
-        fine += abs(out[k]) < math.inf
-    return fine == c.shown * c.samples
-
-
 @outer
 def integrate(  # type: ignore[no-untyped-def]
     ints, floats, rows, heights, mass, reals, values, time, out, log, endings
@@ -365,7 +356,7 @@ def integrate(  # type: ignore[no-untyped-def]
             _turn(c, want, -1 + c.none)
         r.step = dt
     told[OUTCOME], told[ENDED] = outcome, ended
-    told[STEPS], told[SWITCHES], told[FINITE] = r.taken, r.logged, _is_finite(c)
+    told[STEPS], told[SWITCHES], told[FINITE] = r.taken, r.logged, is_finite(c, c.shown)
     told[STRONGEST], told[FARTHEST] = r.largest, c.scales[OF_W]
     told[DAMPED_OUT] = r.damped
     told[MOTION_LOST], told[STRESS_LOST] = c.worst[0], c.worst[1]

@@ -6,6 +6,8 @@ of displacements: of all nodes, or of the top only.
 
 from __future__ import annotations
 
+import math
+
 from numba import types
 
 from foamfit.solve.compiled.motion import dense, rates_of
@@ -57,6 +59,15 @@ def _rise(c, i, reach):  # type: ignore[no-untyped-def]
     for j in range(p):
         reach[j] += height * strain[j] + eps * own[j]
     return height * eps
+
+
+@inner
+def is_finite(c, rows):  # type: ignore[no-untyped-def]
+    """Whether all samples of the first rows of the response are finite."""
+    out, fine = c.out, c.none
+    for k in range(rows * c.samples):
+        fine += abs(out[k]) < math.inf
+    return fine == rows * c.samples
 
 
 @inner

@@ -12,8 +12,8 @@ import math
 from foamfit.solve.compiled.events import change_branch
 from foamfit.solve.compiled.motion import ONLY_DERIVATIVES, evaluate, rates_of
 from foamfit.solve.compiled.run import begin_run, numbers, spring
-from foamfit.solve.compiled.samples import row_of
-from foamfit.solve.scene import STRESS
+from foamfit.solve.compiled.samples import is_finite, row_of
+from foamfit.solve.scene import MOTION, STRESS
 from foamfit.springs.compiled.contract import BY_STRESS, call_number, inner, outer, past
 
 LEAST = 1e-6  # strain to whose rounding error elongations are always resolved
@@ -249,7 +249,8 @@ def balance(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Follow undamped, massless springs in series along a motion or stress of the top.
 
-    `history` (2, springs, n) becomes strains and branches.
+    `history` (2, springs, n) becomes strains and branches. Return the largest error of an
+    elongation, infinite if a sample is not finite.
     """
     c = begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals)
     before = 0.0
@@ -261,3 +262,8 @@ def balance(  # type: ignore[no-untyped-def]
         for i in range(c.count):
             s = spring(c, i)
             history[0, i, k], history[1, i, k] = s.eps, s.branch
+    miss, top = 0.0 if is_finite(c, c.shown) else math.inf, row_of(c, c.none, c.shown - 1)
+    for k in range(c.samples if c.top == MOTION else c.none):
+        miss = max(miss, abs(top[k] - c.values[k]))
+        top[k] = c.values[k]
+    return miss

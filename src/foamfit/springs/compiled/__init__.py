@@ -74,11 +74,9 @@ def solver_row(law: Law, values: Array, terms: ArrayLike, room: int) -> Array | 
 
 def fill_row(made: Compiled, values: Array, terms: Array, room: int, row: Array) -> bool:
     """Fill the row of a spring (see `solver_row`); return whether it is admissible."""
-    from foamfit.springs.compiled.contract import TINY
-
     own, eta = 1 + 2 * room, values.item(-1)
     fine = made.fill(values[:-1], row[own : own + made.columns]) and eta >= 0.0
-    row[0] = TINY if made.damps and eta == 0.0 else eta
+    row[0] = made.least_eta if eta == 0.0 else eta
     if room:
         row[2:own:2] = np.inf  # unused terms
         row[1 : 1 + terms.size] = terms

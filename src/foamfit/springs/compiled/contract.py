@@ -202,7 +202,7 @@ class Compiled(NamedTuple):
     #: columns of the row with slopes dσ/dε (Pa) of branches at zero stress, that at rest first
     slopes: tuple[int, ...] = ()
     pole: int = -1  #: column of the row with ε_*, if the strain stays below 1 + ε_*
-    damps: bool = False  #: whether V depends on the strain rate
+    least_eta: float = 0.0  #: TINY if V depends on the strain rate, Pa·s
     flows: int = 0  #: how the state changes within a branch: STILL, FADES or FLOWS
 
 

@@ -24,6 +24,7 @@ from foamfit.springs.compiled.contract import (
     RESULTS,
     SPRING,
     STILL,
+    TINY,
     Compiled,
     call_begin,
     past,
@@ -154,7 +155,9 @@ def compile_law(law: Law) -> Compiled:
     flows = FLOWS if given.along or given.viscous else FADES if given.decay else STILL
     if flows == FADES and (given.ends or given.switch):
         flows = FLOWS
-    return Compiled(fill, kind, columns, count, inside, addresses, (count,), -1, damps > 0.0, flows)
+    return Compiled(
+        fill, kind, columns, count, inside, addresses, (count,), -1, damps * TINY, flows
+    )
 
 
 def _fill(
