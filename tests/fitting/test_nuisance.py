@@ -140,19 +140,26 @@ def test_residuals_of_a_driven_loop_are_weighed_by_their_full_covariance(driven)
 
 
 @pytest.mark.parametrize("terms", [0, 2])
-@pytest.mark.parametrize("mullins", [False, True])
-def test_the_derivative_by_the_zero_of_a_driving_motion_is_that_of_differences(terms, mullins):
+@pytest.mark.parametrize(
+    ("model", "mullins"),
+    [("microscale", False), ("microscale", True), ("linear+microscale", False)],
+)
+def test_the_derivative_by_the_zero_of_a_driving_motion_is_that_of_differences(
+    model, mullins, terms
+):
     """Contact is lost between the loops, at an instant when the motion does not rest."""
     time = np.linspace(0.0, 8.0, 401)
     strain = 0.35 * (0.5 - 0.5 * np.cos(np.pi * time)) + 0.05 * np.sin(1.3 * time) + 0.06
     test = loop_measurement(1e5 * strain, strain * HEIGHT, Specimen(HEIGHT, AREA), time)
     test = replace(test, noise=Noise(1e3, 1e-9))
-    problem = Options(relaxation=terms, mullins=mullins).problem(test, "microscale", None)
+    problem = Options(relaxation=terms, mullins=mullins).problem(test, model, None)
     values = problem.vector()
-    for name, value in zip(problem.model.names, OF_SPRING[:7], strict=False):
-        values[problem.index[name]] = value
+    top = f"s{1 + model.count('+')}"
+    for name in Model.parse("microscale").names[:7]:
+        values[problem.index[name.replace("s1", top)]] = getattr(SPRING, name[3:])
     for i in range(terms):
-        values[problem.index[f"s1_g{i + 1}"]], values[problem.index[f"s1_tau{i + 1}"]] = 0.5, 3.0**i
+        for name, value in (("g", 0.5), ("tau", 3.0**i)):
+            values[problem.index[f"{top}_{name}{i + 1}"]] = value
     place = problem.index["displacement_zero"]
     values[place] = 0.07 * HEIGHT
     names = ("s1_k0", "displacement_zero")

@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_memory import BISTABLE, LINEAR, chain, names_of, value_of, with_value
+from test_memory import AREA, BISTABLE, LINEAR, chain, names_of, value_of, with_value
 
 import foamfit as ff
 from foamfit.solve.plan import Motion, plan
 from foamfit.springs.chain import Drive
+from foamfit.springs.laws.record import BEGUN, HEAVIER, STRUCK
+from foamfit.springs.laws.record import MOVED as MOVED_BY
 from foamfit.springs.spring import Spring
 
 TIME = np.linspace(0.0, 8e-4, 81)
@@ -118,6 +120,52 @@ def test_sensitivities_against_differences(label: str) -> None:
             expected = (4.0 * one - two) / 3.0  # Richardson
             allowed = 1e-6 * max(float(np.ptp(expected)), scale)
             assert np.all(np.abs(size * exact - expected)[..., away] <= allowed), name
+
+
+def with_change(drive: Drive, what: int, by: float) -> Drive:
+    """Return a drive of another velocity, mass or motion in contact."""
+    if isinstance(drive, ff.Impact):
+        faster, heavier = by * (what == STRUCK), by * AREA * (what == HEAVIER)
+        return ff.Impact(drive.mass + heavier, drive.velocity + faster, drive.gravity)
+    moved = drive.displacement
+    return ff.DisplacementDrive(np.where(moved > 0.0, moved + by, moved))
+
+
+BY_DRIVE = {label: one for label, one in SCENES.items() if not isinstance(one[1], ff.StressDrive)}
+BY_DRIVE["impact with gravity"] = (chain(PAIR, [5e-5, 0.0], 30.0), ff.Impact(7e-3, 2.0, 2e3))
+SIZES = {MOVED_BY: 5e-4, BEGUN: TIME[-1], STRUCK: 2.0, HEAVIER: 7e-3 / AREA}
+
+
+@pytest.mark.parametrize("label", BY_DRIVE)
+def test_derivatives_by_the_drive_against_differences(label: str) -> None:
+    """By contact time, velocity and areal mass of an impact, and by a shift of a motion."""
+    scene, drive = BY_DRIVE[label]
+    impact = isinstance(drive, ff.Impact)
+    time = TIME - 2.5e-5 if impact else TIME  # the striker approaches
+    kinds = (BEGUN, STRUCK, HEAVIER) if impact else (MOVED_BY,)
+
+    def run(what: int, by: float, *directions: tuple[int, int]) -> Motion:
+        there = plan(scene, with_change(drive, what, by), time - by * (what == BEGUN))
+        asked = np.array(directions, np.int64).reshape(-1, 2)
+        given = scene.arrays.rows, scene.arrays.heights, 1e-12
+        return there.run(*given, directions=asked)
+
+    got = run(0, 0.0, *((-1, what) for what in kinds))
+    events = [0.0 if impact else -1.0, got.contact_end, *got.switches[:, 0]]
+    near = np.abs(time[:, None] - np.array([events])) < 4e-3 * time[-1]
+    away = ~near.any(axis=1)
+    assert away.mean() > 0.8
+    for k, what in enumerate(kinds):
+        step = 2e-5 * SIZES[what]
+        one, two = ([run(what, way * s) for way in (1, -1)] for s in (step, 2.0 * step))
+        for name in ("displacement", "base_stress"):
+            short, wide = (getattr(up, name) - getattr(down, name) for up, down in (one, two))
+            expected = (8.0 * short - wide) / (12.0 * step)  # Richardson
+            off = np.abs(getattr(got.slopes, name)[k] - expected)[..., away]
+            if (what, name) == (MOVED_BY, "displacement"):
+                off = off[:-1]  # the top is prescribed
+            scale = float(np.ptp(getattr(got, name))) / SIZES[what]
+            assert np.all(off <= 1e-6 * max(float(np.ptp(expected)), scale)), (what, name)
 
 
 def test_a_dashpot_of_zero_has_a_sensitivity() -> None:

@@ -32,7 +32,7 @@ from foamfit.fitting.curves import (
 from foamfit.solve.plan import Motion, Plan
 from foamfit.solve.plan import plan as make_plan
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
-from foamfit.springs.laws.record import MOVED
+from foamfit.springs.laws.record import BEGUN, HEAVIER, MOVED, STRUCK
 from foamfit.springs.model import Model
 
 Places = NDArray[np.int64]
@@ -42,9 +42,12 @@ NOWHERE: Places = np.empty(0, np.int64)
 STRESSES = ("stress_time", "stress_strain")
 MAX_STEPS = 20_000  # a trial that needs more steps is too stiff and counts as failed
 FINEST = 8  # most instants simulated per sample that averages rows of the file
-# Steps of difference quotients: velocity and mass, relative; times, in sampling intervals; and the
-# zero of a motion, as a fraction of its range.
-RELATIVE_STEP, STEP_OF_TIME, STEP_OF_ZERO = 1e-3, 0.02, 1e-4
+STEP_OF_TIME = 0.02  # of the derivative of a late reading, in sampling intervals
+# Directions of the solver for nuisance parameters. In an impact the motion may be late.
+OF_NUISANCE = {
+    "displacement_zero": MOVED, nuisances.CONTACT_TIME: BEGUN, nuisances.TIME_SHIFT: BEGUN,
+    nuisances.VELOCITY: STRUCK, nuisances.STRIKER_MASS: HEAVIER,
+}  # fmt: skip
 
 
 class Wanted(NamedTuple):
@@ -52,11 +55,11 @@ class Wanted(NamedTuple):
 
     size: int
     own: Places  # rows of the derivatives by parameters of springs
-    directions: Places  # of the solver; the last one by a shift of the motion, if `moved`
+    directions: Places  # of the solver: those of springs, then those of nuisance parameters
     others: tuple[tuple[int, str], ...]  # rows and names of nuisance parameters
+    columns: dict[str, int]  # places of nuisance parameters among the directions
     damped: bool  # whether one is by a dashpot
     by_site: tuple[int, ...]  # rows of the derivative by site_eta
-    moved: bool
 
 
 def _stacked(motion: Motion, node: int | None = None) -> Array:
@@ -85,10 +88,10 @@ class Scenes:
     interior_mass: bool
     followed: tuple[SmoothMotion | None, ...] = ()
     averaged: float = np.inf
-    _asked: dict[bytes, Wanted] = field(default_factory=dict, init=False)
+    _asked: dict[tuple[bytes, bool], Wanted] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
-        """Prepare the instants, the plans and the steps of difference quotients."""
+        """Prepare the instants and the plans."""
         test = self.measurement
         assert test.stress is not None  # checked by check_drive
         self.driven = self.drive == "displacement"
@@ -135,17 +138,6 @@ class Scenes:
         zeros = {curve: channels.get(channel_of(curve), "") for curve in self.curves}
         return {curve: zero for curve, zero in zeros.items() if zero in self.nuisance}
 
-    @cached_property
-    def _steps(self) -> dict[str, float]:
-        """Steps of difference quotients by nuisance parameters."""
-        gap = float(np.median(np.diff(self.clock)))
-        steps = dict.fromkeys(self.nuisance, STEP_OF_TIME * gap)
-        steps |= {name: RELATIVE_STEP * self.usual[name] for name in nuisances.STRIKER}
-        if self.measurement.displacement is not None:
-            span = float(np.ptp(self.measurement.displacement))
-            steps["displacement_zero"] = STEP_OF_ZERO * span
-        return steps
-
     def moved_by(self, change: Array | float) -> Scenes:
         """Return the scenes with a changed driving motion."""
         other = copy(self)
@@ -187,22 +179,27 @@ class Scenes:
 
     # ------------------------------------------------------------------ curves and derivatives
 
-    def wanted(self, places: Places) -> Wanted:
-        """Return the derivatives by the parameters at `places`, prepared once."""
-        key = places.tobytes()
+    def wanted(self, places: Places, followed: bool) -> Wanted:
+        """Return the derivatives by the parameters at `places`, prepared once.
+
+        `followed` is whether springs follow the measured motion.
+        """
+        key = places.tobytes(), followed
         if (found := self._asked.get(key)) is None:
             names, count = self.model.names, len(self.model.names)
             own = np.flatnonzero(places < count)
             rows = ((row, place - count) for row, place in enumerate(places.tolist()))
             others = tuple((row, self.nuisance[i]) for row, i in rows if i >= 0)
             damped = any(place in self._dashpots for place in places.tolist())
-            zero = any(name == "displacement_zero" for _, name in others)
-            moved = zero and self.plans[damped].moves_one
-            directions = self.model.directions[places[own]]
-            if moved:
-                directions = np.append(directions, [(0, MOVED)], axis=0)
+            adds = () if followed else ("displacement_zero",)  # which moves nothing
+            more = [name for _, name in others if name in OF_NUISANCE and name not in adds]
+            columns = {name: own.size + k for k, name in enumerate(more)}
+            given = [(-1, OF_NUISANCE[name]) for name in more]
+            directions = np.concatenate(
+                (self.model.directions[places[own]], np.reshape(given, (-1, 2)).astype(np.int64))
+            )
             site = tuple(r for r, p in enumerate(places[own].tolist()) if p == len(names) - 1)
-            found = Wanted(places.size, own, directions, others, damped, site, moved)
+            found = Wanted(places.size, own, directions, others, columns, damped, site)
             self._asked[key] = found
         return found
 
@@ -217,7 +214,8 @@ class Scenes:
         count = len(self.model.names)
         springs, given = values[:count], values[count:].tolist()
         at = dict(zip(self.nuisance, given, strict=True))
-        wanted = self.wanted(places)
+        followed = self.driven or "stress_strain" in counted or everything
+        wanted = self.wanted(places, followed)
         curves, motion = self._curves(springs, at, wanted, counted, everything)
         if not wanted.others:
             return curves, motion
@@ -226,57 +224,34 @@ class Scenes:
         for name, rows in curves.items():
             out[name][0], out[name][1 + wanted.own] = rows[0], rows[1 : 1 + own]
         for row, name in wanted.others:
-            if wanted.moved and name == "displacement_zero":  # a larger zero means a smaller motion
-                by = {curve: -rows[-1] for curve, rows in curves.items()}
-            elif name == nuisances.FORCE_SCALE:
-                by = self._by_scale({curve: rows[0] for curve, rows in curves.items()}, at)
-            else:
-                by = self._by_nuisance(springs, at, name, counted, everything)
-            for curve in out:
-                out[curve][1 + row] = by[curve]
+            for curve, rows in curves.items():
+                out[curve][1 + row] = self._by_nuisance(name, curve, rows, at, wanted)
         return out, motion
 
     def _is_damped(self, springs: Array) -> bool:
         """Return whether a spring has a dashpot."""
         return any(springs.item(i) != 0.0 for i in self._dashpots)
 
-    def _by_scale(self, curves: dict[str, Array], at: dict[str, float]) -> dict[str, Array]:
-        """Return the derivative of the curves by the scale of the force."""
-        return {
-            name: (at.get(self._zeros.get(name, ""), 0.0) - curve) / at[nuisances.FORCE_SCALE]
-            if name in STRESSES
-            else np.zeros(curve.size)
-            for name, curve in curves.items()
-        }
-
     def _by_nuisance(
-        self, springs: Array, at: dict[str, float], name: str, counted: tuple[str, ...],
-        everything: bool,
-    ) -> dict[str, Array]:  # fmt: skip
-        """Return the derivative of the curves by one nuisance parameter.
+        self, name: str, curve: str, rows: Array, at: dict[str, float], wanted: Wanted
+    ) -> Array:
+        """Return the derivative of a curve by a nuisance parameter, (n,).
 
-        The zero of a channel is simply added to it. Other derivatives are central difference
-        quotients of two simulations, including the zero of a motion that the stress follows.
+        `rows` are the curve and its derivatives by the directions of the solver.
         """
-        n, step, zero = self.time.size, self._steps[name], "displacement_zero"
-        followed = self.driven or "stress_strain" in counted or everything
-        if name in nuisances.ZEROS and not (followed and name == zero):
-            return {
-                curve: np.full(n, float(self._zeros.get(curve) == name)) for curve in self.curves
-            }
-        if self.drive != "impact" and name not in (nuisances.TIME_SHIFT, zero):
-            return {curve: np.zeros(n) for curve in self.curves}
-        nothing = self.wanted(NOWHERE)
-        before, after = (
-            self._curves(springs, at | {name: at[name] + side * step}, nothing, counted, everything)
-            for side in (-0.5, 0.5)
-        )
-        slopes = {curve: (after[0][curve][0] - before[0][curve][0]) / step for curve in after[0]}
-        if name == nuisances.CONTACT_TIME:  # where the stress jumps if there is a dashpot
-            jumped = np.abs(self.clock - at[name]) <= step
-            for slope in slopes.values():
-                slope[np.any(jumped.reshape(n, -1), axis=1)] = 0.0
-        return slopes
+        by = np.full(rows.shape[1], float(self._zeros.get(curve) == name))
+        if name == nuisances.FORCE_SCALE and curve in STRESSES:
+            return np.asarray((at.get(self._zeros.get(curve, ""), 0.0) - rows[0]) / at[name])
+        forces = (nuisances.TIME_SHIFT, "impact", "stress_time")  # which are never late
+        column = wanted.columns.get(name)
+        if column is None or (name, self.drive, curve) == forces:
+            return by
+        factors = {
+            "displacement_zero": -1.0,  # a larger zero means a smaller motion
+            nuisances.STRIKER_MASS: 1.0 / self.measurement.specimen.area,
+        }
+        by += factors.get(name, 1.0) * rows[1 + column]
+        return by
 
     def _curves(
         self, springs: Array, at: dict[str, float], wanted: Wanted, counted: tuple[str, ...],
@@ -317,7 +292,7 @@ class Scenes:
         asked = self.present if everything else counted
         parts = {name: _stacked(*runs[name]) for name in asked if name in runs}
         if ACCELERATION in asked:
-            parts[ACCELERATION] = self._acceleration(shown, drag, at, wanted.by_site)
+            parts[ACCELERATION] = self._acceleration(shown, drag, at, wanted)
         out = {name: self._read(name, rows, at, wanted) for name, rows in parts.items()}
         if everything:
             motion = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
@@ -329,7 +304,8 @@ class Scenes:
         if scale != 1.0 and name in STRESSES:
             rows = rows / scale
         rows = rows if self._plain else self._sampled(rows)
-        rows = self._late(name, rows, late) if late else rows
+        column = wanted.columns.get(nuisances.TIME_SHIFT)
+        rows = rows if late == 0.0 and column is None else self._late(name, rows, late, column)
         if zero := at.get(self._zeros.get(name, ""), 0.0):
             rows = np.concatenate([rows[:1] + zero, rows[1:]])
         if wanted.by_site:
@@ -382,19 +358,31 @@ class Scenes:
         switches[:, 0] += contact
         return motion._replace(switches=switches, contact_end=motion.contact_end + contact)
 
-    def _late(self, name: str, rows: Array, late: float) -> Array:
-        """Return curves on the clock of the file, whose motion is `late` seconds late."""
-        if self.drive == "impact" and name != "stress_strain":
+    def _late(self, name: str, rows: Array, late: float, column: int | None) -> Array:
+        """Return curves on the clock of the file, whose motion is `late` seconds late.
+
+        `column` is the place of their derivative by this time among the directions.
+        """
+        by_stress = self.drive == "stress"
+        simulated = self.drive == "impact" and name != "stress_strain"
+        if simulated or (name in STRESSES) == by_stress:
             return rows
-        if self.drive == "stress":
-            return later(self.time, rows, late) if name.startswith("displacement") else rows
-        if name.startswith("displacement"):
-            return rows
-        when = self.time + late
-        return np.array([np.interp(when, self.time, row) for row in rows])
+
+        def read(row: Array, late: float) -> Array:
+            if by_stress:
+                return later(self.time, row, late)
+            return np.interp(self.time + late, self.time, row)
+
+        out = np.array([read(row, late) for row in rows])
+        if column is not None:
+            step = STEP_OF_TIME * float(np.median(np.diff(self.time)))
+            out[1 + column] = (read(rows[0], late + step) - read(rows[0], late - step)) / (
+                2.0 * step
+            )
+        return out
 
     def _acceleration(
-        self, motion: Motion, drag: float, at: dict[str, float], by_site: tuple[int, ...]
+        self, motion: Motion, drag: float, at: dict[str, float], wanted: Wanted
     ) -> Array:
         """Return the deceleration of the striker, m/s², and its derivatives.
 
@@ -409,8 +397,10 @@ class Scenes:
         per_mass = self.measurement.specimen.area / at[nuisances.STRIKER_MASS]
         braked = np.where(self.clock < at[nuisances.CONTACT_TIME], 0.0, speed)
         pushed: Array = per_mass * (_stacked(motion) + drag * braked)
-        for row in by_site:
+        for row in wanted.by_site:
             pushed[1 + row] += per_mass * braked[0]
+        if (heavier := wanted.columns.get(nuisances.STRIKER_MASS)) is not None:
+            pushed[1 + heavier] -= per_mass * pushed[0]  # by the areal mass
         return pushed
 
 

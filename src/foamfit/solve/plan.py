@@ -22,7 +22,7 @@ from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled, slopes_of
-from foamfit.springs.compiled.contract import FLOWS, INTERNAL, STILL, TINY, Compiled
+from foamfit.springs.compiled.contract import FLOWS, INTERNAL, TINY, Compiled
 from foamfit.springs.laws.record import MOVED, OWN_RELAXATION, Law
 from foamfit.springs.spring import as_samples
 
@@ -98,12 +98,6 @@ class Plan(NamedTuple):
     max_explicit: int  #: explicit steps before implicit ones are tried
     least: float = LEAST_VIBRATING  #: least error of an implicit step of undamped springs
     implicit: bool | None = None  #: whether steps are implicit; None: only in stiff scenes
-
-    @property
-    def moves_one(self) -> bool:
-        """Whether responses have a derivative by the prescribed motion: those of one spring."""
-        alone = self.solver == CLOSED_FORM and self.top == scenes.MOTION and self.ends == (1,)
-        return alone and self.laws.made[0].flows == STILL
 
     def run(
         self,
@@ -326,12 +320,12 @@ class Plan(NamedTuple):
             outcome = cache.timed(along.follow, *given, *drive, out, NO_SWITCHES, samples)
             if outcome == along.UNFIT:
                 return None
-            fine, history = outcome == scenes.DONE, (strain[None], samples[None, :, 2])
+            fine, strains, branches = outcome == scenes.DONE, strain[None], samples[None, :, 2]
             out[0, 1], out[1:, 1] = self.values, 0.0
             dashpot = rows.item(0, 0), heights.item(0)
             histories.add_dashpot(out, self.time, strain, *dashpot, own, samples)
         else:
-            history = np.empty((2, count, n))
+            strains, branches = history = np.empty((2, count, n))
             drive = self.mass, reals, self.values, self.time
             miss = cache.timed(static.balance, *given, *drive, out, NO_SWITCHES, history)
             fine = miss <= AT_MOST * self.height or miss <= AT_MOST * np.abs(self.values).max()
@@ -341,9 +335,9 @@ class Plan(NamedTuple):
         slopes = Slopes(out[1:, 1:], out[1:, 0]) if wanted else None
         if slopes is not None and everything and self.top == scenes.MOTION and count > 1:
             rows = rows[:, 1 + 2 * self.terms :]
-            shared = histories.on_one_plateau(self.laws.made, rows, history[1], directions)
+            shared = histories.on_one_plateau(self.laws.made, rows, branches, directions)
             slopes = slopes._replace(one_sided=shared)
-        switches = histories.switches(self.time, *history) if everything else NO_SWITCHES
+        switches = histories.switches(self.time, strains, branches) if everything else NO_SWITCHES
         return Motion(out[0, 1:], out[0, 0], math.nan, switches, 0, CLOSED_FORM, slopes)
 
     @property

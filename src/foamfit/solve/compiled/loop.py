@@ -49,6 +49,7 @@ from foamfit.springs.compiled.contract import (
     pointed,
     start,
 )
+from foamfit.springs.laws.record import BEGUN, STRUCK
 
 # Numbers that a run is given, after onsite damping and pace: velocity of a striker, tolerance,
 # bound on steps, length of a short implicit step, whether the contact is overdamped, whether
@@ -259,6 +260,21 @@ def _begin(c, reals):  # type: ignore[no-untyped-def]
         approach(c, reals[SPEED])
 
 
+@inner
+def _strike(c, want):  # type: ignore[no-untyped-def]
+    """Fill the rates at contact; derivatives by its time and by the velocity of the striker."""
+    y, p, top = c.y, c.p, c.groups - 1
+    rates(c, y, c.stage, want, 0.0)
+    for j in range(p):
+        what = c.directions[2 * j + 1]
+        if what == STRUCK:
+            y[c.base + (2 * top + 1) * p + j] = 1.0
+        for k in range(c.carries if what == BEGUN else c.none):
+            y[c.base + k * p + j] = -c.stage[k]
+    if p > 0:
+        rates(c, y, c.stage, want, 0.0)
+
+
 @pointed(WHOLE(WHOLES_AT, WHOLE, WHOLE, WHOLE))
 def advance(words, how, struck, want):  # type: ignore[no-untyped-def]
     """Go to the first event in the step or to its end, and write its samples.
@@ -323,7 +339,7 @@ def integrate(  # type: ignore[no-untyped-def]
     tol, most, stalled, done = given[TOL], given[MOST], 0, 0
     _begin(c, given)
     if struck:
-        rates(c, c.y, c.stage, want, 0.0)
+        _strike(c, want)
         short = FIRST * r.brief
         r.step = min(r.horizon, short if c.degree and short > 0.0 else _first_step(c, tol))
         if c.inside_at:  # a stress that depends on the rate may stop the striker at once

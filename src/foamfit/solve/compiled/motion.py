@@ -37,7 +37,7 @@ from foamfit.springs.compiled.contract import (
     past,
     pointed,
 )
-from foamfit.springs.laws.record import OWN_RELAXATION
+from foamfit.springs.laws.record import HEAVIER, MOVED, OWN_RELAXATION
 
 #: record, group, state, rates, whether with derivatives, time since the piece began; returns S
 GROUP = REAL(WHOLES_AT, WHOLE, REALS_AT, REALS_AT, WHOLE, REAL)
@@ -194,6 +194,8 @@ def span_tangents(c, g, y, reach, rate):  # type: ignore[no-untyped-def]
     p, last = c.p, g == c.groups - 1
     for j in range(p):
         reach[j] = rate[j] = 0.0
+        if last and c.top == MOTION and c.directions[2 * j + 1] == MOVED:
+            reach[j], rate[j] = c.drive.shifted, c.drive.shift_rate
     if not last or c.top == FREE or c.top == VISCOUS:
         dw = past(y, c.base + 2 * g * p)
         for j in range(p):
@@ -267,6 +269,8 @@ def _accelerate(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
         of_drag = past(c.own, 2 * c.count * p)
         for j in range(p):
             df[p + j] -= of_drag[j] * v * per
+            if c.directions[2 * j + 1] == HEAVIER:
+                df[p + j] += (c.drive.gravity - f[2 * g + 1]) * per
 
 
 @inner
@@ -310,6 +314,7 @@ def compute_rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
     if only == IN_STEP:
         dense(c, c.base, share, y)
         at = c.now.now + share * c.now.step
+    c.drive.shifted = c.drive.shift + c.drive.shift_rate * at
     for g in range(c.groups):
         if only >= 0 and g != only:
             continue

@@ -102,10 +102,11 @@ OF_W, OF_V, OF_EPS, OF_SIGMA, SCALES = range(5)
 # stands still for the laws, else 1; acceleration of the striker by gravity; 1 if dashpots stop a
 # striker long before the springs, see `rates.is_overdamped`; base stress at the start of an
 # implicit step; stress on the top, and rate of the elongation of the group whose stress `internal`
-# solves for.
+# solves for; derivative of the prescribed motion by its shift at the start of the piece, its rate,
+# and its present value.
 DRIVE = (
     "value", "value_rate", "top_speed", "flat", "dragged", "pace", "gravity", "overdamped",
-    "beginning", "push", "spread",
+    "beginning", "push", "spread", "shift", "shift_rate", "shifted",
 )  # fmt: skip
 # Numbers that change during a run: time since the piece began, time at which it begins, step,
 # length of the piece, steps, growth of the next step, largest stress, whether the base stress has

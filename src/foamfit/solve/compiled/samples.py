@@ -32,7 +32,7 @@ from foamfit.springs.compiled.contract import (
     past,
     pointed,
 )
-from foamfit.springs.laws.record import OWN_ETA, OWN_RELAXATION
+from foamfit.springs.laws.record import BEGUN, OWN_ETA, OWN_RELAXATION, STRUCK
 
 INSIDE, FLIGHT, APPROACH = -1, -2, -3  # instead of the number of a sample
 
@@ -228,10 +228,17 @@ def _approach(c, speed):  # type: ignore[no-untyped-def]
     done = c.none
     while done < c.samples and c.time[done] < 0.0:
         done += 1
-    for row in range((1 + c.p) * c.shown):
-        quick = speed if row == c.shown - 1 else 0.0
-        pull = c.drive.gravity if row == c.shown - 1 else 0.0
-        _coast(c, past(c.out, row * c.samples), c.none, done, 0.0, 0.0, quick, pull)
+    for j in range(1 + c.p):
+        what = c.directions[2 * j - 1] if j > 0 else c.none
+        for node in range(c.shown):
+            place = quick = pull = 0.0
+            if node == c.shown - 1:
+                place = -speed if what == BEGUN else 0.0
+                quick = -c.drive.gravity if what == BEGUN else 0.0
+                quick = 1.0 if what == STRUCK else quick
+                if j == 0:
+                    quick, pull = speed, c.drive.gravity
+            _coast(c, row_of(c, j, node), c.none, done, 0.0, place, quick, pull)
     c.now.sample = done
 
 

@@ -226,7 +226,7 @@ def _write(c, k, now):  # type: ignore[no-untyped-def]
             s = spring(c, i)
             evaluate(c, i, 1 + c.none)
             s.tangent, s.total = s.slope, s.sigma
-        c.carried[0] = now
+        c.carried[0], c.drive.shift = now, 1.0 if c.values[k] > 0.0 else 0.0
         rates_of(c, c.none, c.y, c.f, ONLY_DERIVATIVES, 0.0)
     row_of(c, c.none, c.none)[k] = now
     for j in range(p):

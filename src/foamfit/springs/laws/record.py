@@ -21,10 +21,11 @@ from foamfit.springs.loop import Loop
 
 LAST_STRAIN = 0.999
 # Directions of derivatives, beside the places of parameters in their law: dashpot, height, onsite
-# damper, and from OWN_RELAXATION on g and τ of each relaxation term; MOVED is the derivative of a
-# single spring by a shift of the prescribed motion of all samples in contact.
+# damper, and from OWN_RELAXATION on g and τ of each relaxation term. The others are those of a
+# drive: a shift of the prescribed motion of all samples in contact; of an impact its time of
+# contact, velocity, and areal mass of the striker, kg/m².
 OWN_ETA, OWN_HEIGHT, DRAG, OWN_RELAXATION = range(1_000_000, 1_000_004)
-MOVED = -1
+MOVED, BEGUN, STRUCK, HEAVIER = range(-4, 0)
 
 # Conditions on the value of a parameter, by their wording in messages.
 ADMISSIBLE: dict[str, Callable[[float], bool]] = {
