@@ -35,7 +35,7 @@ class Iterate:
     jacobian: Jacobian  # (n, k)
     damping: float | None = None  # with which a descent from here goes on
 
-    @property
+    @cached_property
     def cost(self) -> float:
         """Sum of squares."""
         return float(self.residual @ self.residual)
@@ -64,7 +64,7 @@ class Iterate:
         step = point - self.point
         shown = residual - self.residual - self.jacobian @ step
         jacobian = self.jacobian + np.outer(shown, step / float(step @ step))
-        return replace(self, point=point, residual=residual, jacobian=jacobian)
+        return Iterate(point, residual, jacobian)
 
 
 def damped_step(gradient: Array, normal: Array, damping: float, held: NDArray[np.bool_]) -> Array:
@@ -72,10 +72,12 @@ def damped_step(gradient: Array, normal: Array, damping: float, held: NDArray[np
 
     `damping` multiplies the diagonal of the normal matrix.
     """
-    step, moving = np.zeros(gradient.size), np.flatnonzero(~held)
+    step, moving = np.zeros(gradient.size), (~held).nonzero()[0]
     if not moving.size:
         return step
-    own, slope = normal[moving[:, None], moving], gradient[moving]
+    own, slope = normal.copy(), gradient
+    if moving.size < gradient.size:
+        own, slope = normal[moving[:, None], moving], gradient[moving]
     diagonal = own.ravel()[:: moving.size + 1]  # a view
     diagonal += damping * np.maximum(diagonal, 1e-12 * max(float(diagonal.sum()), 1e-300))
     _, found, failed = dposv(own, -slope)
@@ -129,7 +131,7 @@ def descend(
         step = damped_step(at.gradient, at.normal, damping, held | fixed)
         ended = not step.any() or at.expected(step) < least
         if not ended:
-            trial = np.clip(at.point + step, low, high)
+            trial = np.minimum(np.maximum(at.point + step, low), high)
             moved = trial - at.point
             found = residual(trial)
             gain = at.cost - float(found @ found)
