@@ -23,6 +23,9 @@ from foamfit.springs.laws.record import Between, Param
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
 
+# Sets the parameters that depend on others through expressions, in place, in a vector (n,) or in
+# each column (n, m).
+Tied = Callable[[Array], Array]
 # Coordinates of nuisance parameters at their two limits.
 NUISANCE_BOX = (-1.0, 1.0)
 
@@ -181,8 +184,7 @@ class Space:
     free: tuple[str, ...]  # Names of the parameters that vary
     low: Array  # (n,): Lower limit of every parameter, SI
     high: Array  # (n,): Upper limit of every parameter, SI
-    # Sets the parameters that depend on others through expressions, in place; None without any
-    tied: Callable[[Array], Array] | None
+    tied: Tied | None
     # Parameters whose coordinate is their SI value, so that several tests can share it. Not every
     # point of the box is admissible then.
     absolute: tuple[str, ...] = ()
@@ -310,16 +312,16 @@ class Space:
             moves[at, j] = end - begin
             if not least <= begin + part * (end - begin) <= most:
                 moves[at] = 0.0
-        return self.follow(values, moves, np.full(point.size, 1e-5))
-
-    def follow(self, values: Array, moves: Array, steps: Array) -> Array:
-        """Complete moves (n_values, m) of the parameters by those of dependent parameters.
-
-        They are central differences of the expressions with `steps` (m,); nothing is simulated.
-        """
         if self.tied is None:
             return moves
-        way = steps * moves
-        ahead, behind = self.tied(values[:, None] + way), self.tied(values[:, None] - way)
-        out = (ahead - behind) / (2.0 * steps)
-        return np.where(moves != 0.0, moves, out)  # independent parameters keep exact moves
+        return follow(self.tied, values, moves, np.full(point.size, 1e-5))
+
+
+def follow(tied: Tied, values: Array, moves: Array, steps: Array) -> Array:
+    """Complete moves (n_values, m) of the parameters by those of dependent parameters.
+
+    They are central differences of the expressions with `steps` (m,); nothing is simulated.
+    """
+    way = steps * moves
+    out = (tied(values[:, None] + way) - tied(values[:, None] - way)) / (2.0 * steps)
+    return np.where(moves != 0.0, moves, out)  # independent parameters keep exact moves

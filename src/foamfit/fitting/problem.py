@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -16,7 +16,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.data.units import LARGEST, parse_uncertain
 from foamfit.errors import InputError
 from foamfit.fitting import nuisance
-from foamfit.fitting.box import Scales, Space, others
+from foamfit.fitting.box import Scales, Space, Tied, follow, others
 from foamfit.fitting.curves import (
     check_interior,
     choose_drive,
@@ -285,11 +285,8 @@ class Problem:
             params[name].set(value=one.mean, vary=False)
         return replace(self, params=params, kept=free)
 
-    def tied(self) -> Callable[[Array], Array] | None:
-        """Return a function that sets the parameters given by expressions; None without any.
-
-        It takes a vector (n,), or one in each column (n, m).
-        """
+    def tied(self) -> Tied | None:
+        """Return a function that sets the parameters given by expressions; None without any."""
         tied = [name for name in self.names if self.params[name].expr is not None]
         total, first = self.measurement.specimen.height, self.index.get("s1_height", 0)
         last = first + len(self.model.kinds) - 1
@@ -340,9 +337,9 @@ class Problem:
     def moves(self, values: Array, names: tuple[str, ...]) -> Array:
         """Return how all parameters move with each of these, (n_values, n_names)."""
         moves = np.eye(values.size)[:, [self.index[name] for name in names]]
-        if self.tied() is None:
+        if (tied := self.tied()) is None:
             return moves
-        return self.space().follow(values, moves, 1e-5 * self.sizes(names, values))
+        return follow(tied, values, moves, 1e-5 * self.sizes(names, values))
 
 
 def _check_held(params: lmfit.Parameters) -> None:

@@ -22,7 +22,7 @@ from foamfit.solve.compiled.motion import (
     rates_of,
 )
 from foamfit.solve.compiled.run import STEPPED, numbers, spring, unpack
-from foamfit.solve.compiled.samples import row_of, write
+from foamfit.solve.compiled.samples import KNOWN, row_of, write
 from foamfit.solve.compiled.static import bring, push_to, strain_to
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled.contract import (
@@ -138,6 +138,16 @@ def _derive_start(c, g, i0, i1, common):  # type: ignore[no-untyped-def]
 
 
 @inner
+def _is_damped(c):  # type: ignore[no-untyped-def]
+    """Whether the stress of a spring depends on its strain rate."""
+    damped = False
+    for i in range(c.count):
+        s = spring(c, i)
+        damped = damped or s.eta > 0.0 or s.lossy > 0.0
+    return damped
+
+
+@inner
 def _next_piece(c, want):  # type: ignore[no-untyped-def]
     """Write the sample at the end of a piece, and begin the next; return whether it was the last.
 
@@ -147,14 +157,17 @@ def _next_piece(c, want):  # type: ignore[no-untyped-def]
     if k == 0:  # after a ramp
         call_inside(c, END_RAMP, c.none, want, c.y, c.stage, c.y, c.y)
         _begin_piece(c, k)
-    write(c, c.y, r.now, k, want)
-    r.piece = k
+    r.piece, jumps = k, k > 0 and c.top == MOTION and c.groups == 1 and _is_damped(c)
+    if jumps or k == c.samples - 1:
+        write(c, c.y, r.now, k, want)
     if k == c.samples - 1:
         return 1
     if k > 0:
         _begin_piece(c, k)
     rates(c, c.y, c.stage, want, 0.0)
-    if c.top == MOTION and c.groups == 1 and k > 0:
+    if not jumps:
+        write(c, c.y, 0.0, k, KNOWN + c.none)
+    else:
         share, out = (t[k] - t[k - 1]) / (t[k + 1] - t[k - 1]), row_of(c, c.none, c.none)
         out[k] += share * (c.carried[0] - out[k])
         for j in range(c.p):

@@ -35,6 +35,7 @@ from foamfit.springs.compiled.contract import (
 from foamfit.springs.laws.record import BEGUN, OWN_ETA, OWN_RELAXATION, STRUCK
 
 INSIDE, FLIGHT, APPROACH = -1, -2, -3  # instead of the number of a sample
+KNOWN = -1  # instead of whether with derivatives, if all values are those of the state
 
 
 @inlined
@@ -80,16 +81,20 @@ def _put(c, node, k, value, slopes):  # type: ignore[no-untyped-def]
 
 @inner
 def _write(c, y, at, k, want):  # type: ignore[no-untyped-def]
-    """Write sample k from a state at a time since the piece began."""
+    """Write sample k from a state at a time since the piece began.
+
+    The values of all springs are KNOWN or computed, with derivatives if they are wanted.
+    """
     every, p, last = c.shown > 2, c.p, c.groups - 1
     reach = past(c.common, (c.groups + 1) * p)
-    rates_of(c, c.none, y, c.f, want, at)
+    if want != KNOWN:
+        rates_of(c, c.none, y, c.f, want, at)
     _put(c, c.none, k, c.carried[0], c.common)
     for g in range(c.none if every else last, c.groups):
         solved = g < c.nodes
         top = c.ends[g] if every else c.shown - 1
         if every or not (solved or c.top == MOTION):
-            if g > 0:
+            if g > 0 and want != KNOWN:
                 rates_of(c, g, y, c.f, want, at)
             place = place_nodes(c, g, y, reach)
             for i in range(c.ends[g - 1] if g > 0 else c.none, c.ends[g]):
