@@ -220,8 +220,7 @@ class Plan(NamedTuple):
             most = self.max_explicit
         over = False
         if degree and self.speed > 0.0:
-            first = self._slopes(rows)[0]
-            over = rates.is_overdamped(first, rows[:, 0], heights, float(self.mass[-1]))
+            over = rates.is_overdamped(*self._in_numbers(rows, heights), self.mass.item(-1))
         scales = self._scales(rows, heights)
         return np.array((drag, 1.0, self.speed, tol, most, brief, over, followed, *scales))
 
@@ -269,12 +268,18 @@ class Plan(NamedTuple):
             endings[loop.FINITE] = np.isfinite(out[0]).all()
         return self._motion(out, AGGREGATE, endings, log, rows, 0.0)
 
+    def _in_numbers(
+        self, rows: Array, heights: Array
+    ) -> tuple[list[float], list[float], list[float]]:
+        """Return the slope at rest, η and height of each spring."""
+        return self._slopes(rows)[0].tolist(), rows[:, 0].tolist(), heights.tolist()
+
     def _brief(self, rows: Array, heights: Array, drag: float, tol: float) -> float:
         """Return the length of a short implicit step, s."""
         duration = self._duration
         if self.speed > 0.0:
-            first = self._slopes(rows)[0]
-            lasts = rates.contact_time(first, rows[:, 0], heights, float(self.mass[-1]), drag)
+            springs = self._in_numbers(rows, heights)
+            lasts = rates.contact_time(*springs, self.mass.item(-1), drag)
             duration = min(duration, 5.0 * lasts)
         short: float = SHORT * duration * (tol / 3e-8) ** (1.0 / 6.0)
         return short
@@ -322,8 +327,9 @@ class Plan(NamedTuple):
                 return None
             fine, strains, branches = outcome == scenes.DONE, strain[None], samples[None, :, 2]
             out[0, 1], out[1:, 1] = self.values, 0.0
-            dashpot = rows.item(0, 0), heights.item(0)
-            histories.add_dashpot(out, self.time, strain, *dashpot, own, samples)
+            eta = rows.item(0, 0)
+            histories.add_dashpot(out, self.time, strain, eta, heights.item(0), own, samples)
+            fine = fine and (eta == 0.0 or bool(np.isfinite(out[0, 0]).all()))
         else:
             strains, branches = history = np.empty((2, count, n))
             drive = self.mass, reals, self.values, self.time
@@ -347,11 +353,12 @@ class Plan(NamedTuple):
     def fastest_rates(self, rows: Array, heights: Array, drag: float) -> tuple[float, float]:
         """Return the radians of vibration and relaxation that explicit steps would cover."""
         first, steep = self._slopes(rows)
-        gain = 1.0 + rows[:, 1 : 1 + 2 * self.terms : 2].sum(axis=1)
-        eta = np.where(rows[:, 0] > TINY, rows[:, 0], 0.0)
-        ends = np.array(self.ends)
-        chain = gain * first, gain * steep, eta, heights, ends, self.mass, drag, self.top
-        return rates.fastest_rates(*chain, self.speed > 0.0, self._duration)
+        if self.terms:
+            gain = 1.0 + rows[:, 1 : 1 + 2 * self.terms : 2].sum(axis=1)
+            first, steep = gain * first, gain * steep
+        eta = [one if one > TINY else 0.0 for one in rows[:, 0].tolist()]
+        chain = first.tolist(), steep.tolist(), eta, heights.tolist(), self.ends, self.mass.tolist()
+        return rates.fastest_rates(*chain, drag, self.top, self.speed > 0.0, self._duration)
 
 
 def _time(t: ArrayLike) -> Array:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 
-import numpy as np
-
-from foamfit.arrays import Array
 from foamfit.solve.compiled.run import spring
 from foamfit.solve.scene import FREE, STRESS, VISCOUS
 from foamfit.springs.compiled.contract import inner
@@ -16,31 +14,41 @@ from foamfit.springs.compiled.contract import inner
 OVERDAMPED = 1e3
 
 
-def contact_time(first: Array, eta: Array, heights: Array, mass: float, drag: float) -> float:
+def _compliance(heights: Iterable[float], slopes: Iterable[float]) -> float:
+    """Return the sum of h/k, m/Pa or m/(Pa·s)."""
+    return sum(h / k if k > 0.0 else math.inf for h, k in zip(heights, slopes, strict=True))
+
+
+def contact_time(
+    first: Sequence[float], eta: Sequence[float], heights: Sequence[float], mass: float, drag: float
+) -> float:
     """Return a rough estimate of the duration of contact of a striker with the chain, s."""
-    soft = float(np.sum(heights / first))
-    return math.sqrt(mass * soft) + drag * soft + float(np.max(eta / first))
+    soft = _compliance(heights, first)
+    slowest = max(loss / k if k > 0.0 else math.inf for loss, k in zip(eta, first, strict=True))
+    return math.sqrt(mass * soft) + drag * soft + slowest
 
 
-def is_overdamped(first: Array, eta: Array, heights: Array, mass: float) -> bool:
+def is_overdamped(
+    first: Sequence[float], eta: Sequence[float], heights: Sequence[float], mass: float
+) -> bool:
     """Whether dashpots stop a striker of that mass long before the springs throw it back.
 
     With the rates a = k/c of creep and b = c/m of stopping, contact ends when the base stress has
     fallen to (a/b)² of its peak, which explicit steps, with errors relative to the peak, miss.
     """
-    if not eta.all():
+    if not all(eta):
         return False
-    soft, flow = float(np.sum(heights / first)), float(np.sum(heights / eta))
+    soft, flow = _compliance(heights, first), _compliance(heights, eta)
     return soft > OVERDAMPED * flow * flow * mass
 
 
 def fastest_rates(
-    first: Array,
-    steep: Array,
-    eta: Array,
-    heights: Array,
-    ends: Array,
-    mass: Array,
+    first: Sequence[float],
+    steep: Sequence[float],
+    eta: Sequence[float],
+    heights: Sequence[float],
+    ends: Sequence[int],
+    mass: Sequence[float],
     drag: float,
     top: int,
     struck: bool,
@@ -51,36 +59,35 @@ def fastest_rates(
     `first` and `steep` are the slopes of the springs at rest and at most, `mass` that of the nodes;
     both estimates are infinite if the scene `is_overdamped`.
     """
-    if struck and is_overdamped(first, eta, heights, float(mass[-1])):
+    if struck and is_overdamped(first, eta, heights, mass[-1]):
         return math.inf, math.inf
     vibration = relaxation = below_stiff = below_damp = 0.0
     i0 = 0
-    for g, end in enumerate(ends.tolist()):
-        own, loose = slice(i0, end), eta[i0:end] == 0.0
+    for g, end in enumerate(ends):
+        own = range(i0, end)
         # compliance of the springs without dashpot; the others are rigid at first
-        soft = float(np.sum((heights[own] / steep[own])[loose]))
-        damp = 0.0 if loose.any() else 1.0 / float(np.sum(heights[own] / eta[own]))
+        loose = [i for i in own if eta[i] == 0.0]
+        soft = _compliance([heights[i] for i in loose], [steep[i] for i in loose])
+        damp = 0.0 if loose else 1.0 / _compliance(heights[i0:end], eta[i0:end])
         stiff = 1.0 / soft if soft > 0.0 else 0.0
         if soft == 0.0 and end - i0 == 1:
-            stiff = float(steep[i0] / heights[i0])
-        elif end - i0 > 1 and not loose.all():
-            rest = steep[own] + heights[own] * stiff
-            relaxation = max(
-                relaxation, float(np.max((rest / np.where(loose, 1.0, eta[own]))[~loose]))
-            )
+            stiff = steep[i0] / heights[i0]
+        elif end - i0 > 1:
+            rates = [(steep[i] + heights[i] * stiff) / eta[i] for i in own if eta[i] != 0.0]
+            relaxation = max(relaxation, *rates, 0.0)
         if g > 0:
-            relaxation = max(relaxation, (below_damp + damp) / float(mass[g - 1]))
-            vibration = max(vibration, math.sqrt((below_stiff + stiff) / float(mass[g - 1])))
+            relaxation = max(relaxation, (below_damp + damp) / mass[g - 1])
+            vibration = max(vibration, math.sqrt((below_stiff + stiff) / mass[g - 1]))
         below_stiff, below_damp, i0 = stiff, damp, end
     if top == FREE:
-        relaxation = max(relaxation, (below_damp + drag) / float(mass[-1]))
-        vibration = max(vibration, math.sqrt(below_stiff / float(mass[-1])))
+        relaxation = max(relaxation, (below_damp + drag) / mass[-1])
+        vibration = max(vibration, math.sqrt(below_stiff / mass[-1]))
     elif top == VISCOUS:
         relaxation = max(relaxation, below_stiff / drag)
         if below_damp > 1e4 * drag:  # v = (push - Σ)/drag loses its digits
             relaxation = math.inf
     if struck:
-        duration = min(duration, contact_time(first, eta, heights, float(mass[-1]), drag))
+        duration = min(duration, contact_time(first, eta, heights, mass[-1], drag))
     return vibration * duration, relaxation * duration
 
 
