@@ -13,6 +13,7 @@ from conftest import run, run_refused, write_csv
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
 from foamfit.data.rig import candidates, read_rig
 from foamfit.errors import InputError
+from foamfit.study import plan as plan_module
 from foamfit.study.study_file import read_study
 
 QUANTITY = "peak_force at 2.5 m/s"
@@ -161,6 +162,12 @@ def test_files_and_terminal(soft, of_quantity, tmp_path, monkeypatch):
     """The same result and seed give the same plan, in the terminal as in Python."""
     monkeypatch.chdir(tmp_path)
     soft.save("fits/foam/bistable", report=False)
+    with monkeypatch.context() as early:
+        early.setattr(
+            plan_module, "plan", None
+        )  # the folder is refused before anything is computed
+        told = run_refused("plan", "fits/foam/bistable", "--out", "fits/foam/bistable")
+    assert "holds fit.json, which does not belong to a plan" in told
     ran = run("plan", "fits/foam/bistable", "--for", QUANTITY)
     assert ran.exit_code == 0, ran.output
     assert "Next test: an impact of 7 g at" in ran.output

@@ -152,12 +152,15 @@ class Output:
             given = "json" if self.as_json else "no-report"
             raise InputError(f"--open and --{given} exclude each other; leave one of them out")
 
-    def folder(self, default: Path) -> Path:
-        """Return the result folder; InputError if it cannot be written."""
+    def folder(self, default: Path, of: str | None = None) -> Path:
+        """Return the result folder; InputError if it cannot be written.
+
+        With `of`, the name of a result file, only results of this kind may be replaced.
+        """
         from foamfit.report.folder import check_target
 
         folder = default if self.out is None else self.out
-        check_target(folder)
+        check_target(folder, of=of)
         return folder
 
     def finish(

@@ -134,12 +134,9 @@ def predict(
     output.check(without_report=False)
     from foamfit.data.csv_file import read_test
     from foamfit.data.toml_file import toml_beside
-    from foamfit.report.folder import check_target
     from foamfit.study.identified import read_source
 
-    default = Path("predictions", toml_beside(test).stem)
-    check_target(output.out or default, of="prediction.json")
-    folder = output.folder(default)
+    folder = output.folder(Path("predictions", toml_beside(test).stem), "prediction.json")
     read_source(result)  # report a wrong path before anything is compiled
     measurement = read_test(test, specimen, cycle, cycles=cycles)
     from foamfit.study import predict as study
@@ -181,7 +178,7 @@ def plan(
     name = Path(results[0]).resolve()
     own = name.name if (name / "joint.json").is_file() else name.parent.name
     default = own if name.is_dir() else results[0].replace("/", "-")
-    folder = output.folder(Path("plans", default))
+    folder = output.folder(Path("plans", default), "plan.json")
     from foamfit.study import plan as study
 
     options.compile_solver(output.silent)
