@@ -167,7 +167,7 @@ def test_files_and_terminal(soft, of_quantity, tmp_path, monkeypatch):
             plan_module, "plan", None
         )  # the folder is refused before anything is computed
         told = run_refused("plan", "fits/foam/bistable", "--out", "fits/foam/bistable")
-    assert "holds fit.json, which does not belong to a plan" in told
+    assert "which does not belong to a plan" in told
     ran = run("plan", "fits/foam/bistable", "--for", QUANTITY)
     assert ran.exit_code == 0, ran.output
     assert "Next test: an impact of 7 g at" in ran.output
