@@ -246,9 +246,10 @@ class Space:
         return np.stack((self.low, self.high))[:, self._plain[1]]
 
     @cached_property
-    def _dependent(self) -> list[tuple[int, Coordinate]]:
-        """Numbers of coordinates whose ends depend on other parameters, and these, in order."""
-        return [(j, one) for j, one in enumerate(self.coordinates) if one.of]
+    def _dependent(self) -> list[tuple[int, Coordinate, Between]]:
+        """Numbers of coordinates whose ends depend on other parameters, these, and the ends."""
+        every = enumerate(self.coordinates)
+        return [(j, one, one.ends) for j, one in every if one.of and isinstance(one.ends, Between)]
 
     def encode(self, values: Array) -> Array:
         """Return the coordinates of a vector of parameters, moved into the box."""
@@ -271,9 +272,9 @@ class Space:
         low, high = self._bounds
         values[places] = np.minimum(np.maximum(first + step * u, low), high)
         own = values.tolist()
-        for j, one in self._dependent:
-            least, most = one.bounds
-            own[one.place] = min(max(one.value(point.item(j), own), least), most)
+        for j, one, ends in self._dependent:
+            (begin, end), (least, most) = ends.ends(*[own[place] for place in one.of]), one.bounds
+            own[one.place] = min(max(begin + point.item(j) * (end - begin), least), most)
         return self.complete(np.array(own))
 
     def admit(self, values: Array, held: Collection[int] = ()) -> Array:
@@ -301,13 +302,10 @@ class Space:
         low, high = self._bounds
         u = first + step * point[plain]
         moves[places, plain] = np.where(logs, values[places], step * ((low <= u) & (u <= high)))
-        for j, one in self._dependent:
-            at, part, (begin, end), (least, most) = (
-                one.place, point.item(j), one.ends_at(own), one.bounds,
-            )  # fmt: skip
-            assert isinstance(one.ends, Between)
-            by = one.ends.slopes(*(own[place] for place in one.of))
-            for place, (first_by, last_by) in zip(one.of, by, strict=True):
+        for j, one, ends in self._dependent:
+            at, part, given = one.place, point.item(j), [own[place] for place in one.of]
+            (begin, end), (least, most) = ends.ends(*given), one.bounds
+            for place, (first_by, last_by) in zip(one.of, ends.slopes(*given), strict=True):
                 moves[at] += (first_by + part * (last_by - first_by)) * moves[place]
             moves[at, j] = end - begin
             if not least <= begin + part * (end - begin) <= most:
