@@ -18,7 +18,7 @@ import numpy as np
 from scipy import stats
 
 from foamfit.api import FitResult
-from foamfit.arrays import Array, single_threaded
+from foamfit.arrays import Array, Mask, single_threaded
 from foamfit.data.measurement import MEASURED, Measurement, Noise, Specimen, Striker
 from foamfit.data.rig import Candidate, Rig, beyond, candidates, read_rig
 from foamfit.errors import InputError, SimulationError
@@ -219,20 +219,8 @@ def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Kno
     """Return what some tests of one foam say about the parameters of its springs."""
     first = tests[0].problem
     names = tuple(name for name in first.free() if name not in NUISANCE)
-    k, share = len(names), dict[str, list[float]]()
-    sizes, reached, missed = first.sizes(names, tests[0].values), np.zeros(k, dtype=bool), 0.0
-    roots = np.ones((len(tests), k))
-    for t, one in enumerate(tests):
-        best, objective = BestPoint(one.problem, one.values), one.problem.objective
-        reached |= np.array([name not in best.unreached for name in names])
-        if one.fit is None:  # a simulated test has neither noise nor model error
-            continue
-        missed += tolerance(best) / (ALIKE**2 - 1.0)
-        for curve, error in zip(objective.counted, best.errors, strict=True):
-            share.setdefault(curve, []).append(error.law / max(objective.span(curve), 1e-300))
-        for name, found in zip(best.names, best.spread.inflation.tolist(), strict=True):
-            if name in names and math.isfinite(found):
-                roots[t, names.index(name)] = math.sqrt(found)
+    k, sizes = len(names), first.sizes(names, tests[0].values)
+    missed, share, reached, roots = _of_fits(tests, names)
 
     def said(t: int, values: Array) -> tuple[Array, Array]:
         rows = rows_of(tests[t].problem, values, names, sizes)
@@ -240,16 +228,10 @@ def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Kno
 
     found_by = [said(t, one.values) for t, one in enumerate(tests)]
     breads, meats = (np.array(each) for each in zip(*found_by, strict=True))
-    values, places = tests[0].values, [first.index[name] for name in names]
-    if len(tests) > 1:  # the mean, weighted by the information
-        pull = [b @ (one.values[places] / sizes) for b, one in zip(breads, tests, strict=True)]
-        values = values.copy()
-        values[places] = sizes * (np.linalg.pinv(breads.sum(axis=0), rcond=1e-10) @ sum(pull))
-        values = first.space().decode(first.space().encode(values))
-    means = {curve: float(np.mean(each)) for curve, each in share.items()}
+    values = _mean_of(tests, names, sizes, breads)
     both = breads.sum(axis=0)[None], meats.sum(axis=0)[None]
     known = Known(
-        first, values, names, sizes, *both, missed, means, np.ones(k), reached, values[None]
+        first, values, names, sizes, *both, missed, share, np.ones(k), reached, values[None]
     )
     known = replace(known, stretch=_stretch(known, tests))
     if not draws:
@@ -262,6 +244,41 @@ def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Kno
                    for t, test in enumerate(tests)]  # fmt: skip
             bread[i], meat[i] = np.sum(own, axis=0)
     return replace(known, draws=drawn, bread=bread, meat=meat)
+
+
+def _of_fits(
+    tests: Sequence[Test], names: Sequence[str]
+) -> tuple[float, dict[str, float], Mask, Array]:
+    """Return `missed`, `share` and `reached` of `Known`, and what `information` needs of each fit.
+
+    A simulated test has neither noise nor model error.
+    """
+    missed, share = 0.0, dict[str, list[float]]()
+    reached, roots = np.zeros(len(names), dtype=bool), np.ones((len(tests), len(names)))
+    for t, one in enumerate(tests):
+        best, objective = BestPoint(one.problem, one.values), one.problem.objective
+        reached |= np.array([name not in best.unreached for name in names])
+        if one.fit is None:
+            continue
+        missed += tolerance(best) / (ALIKE**2 - 1.0)
+        for curve, error in zip(objective.counted, best.errors, strict=True):
+            share.setdefault(curve, []).append(error.law / max(objective.span(curve), 1e-300))
+        for name, found in zip(best.names, best.spread.inflation.tolist(), strict=True):
+            if name in names and math.isfinite(found):
+                roots[t, names.index(name)] = math.sqrt(found)
+    return missed, {curve: float(np.mean(each)) for curve, each in share.items()}, reached, roots
+
+
+def _mean_of(tests: Sequence[Test], names: Sequence[str], sizes: Array, breads: Array) -> Array:
+    """Return the mean parameters of the tests, weighted by the information in each."""
+    first = tests[0].problem
+    values, places = tests[0].values, [first.index[name] for name in names]
+    if len(tests) == 1:
+        return values
+    pull = [b @ (one.values[places] / sizes) for b, one in zip(breads, tests, strict=True)]
+    values = values.copy()
+    values[places] = sizes * (np.linalg.pinv(breads.sum(axis=0), rcond=1e-10) @ sum(pull))
+    return first.space().decode(first.space().encode(values))
 
 
 def _stretch(known: Known, tests: Sequence[Test]) -> Array:
