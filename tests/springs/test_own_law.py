@@ -292,6 +292,17 @@ def test_variables_that_decay_and_relaxation_agree_with_steps_in_time(bouc_wen: 
     _agree(got, want, dict(zip(names, names, strict=True)), 1e-9)
 
 
+@pytest.mark.parametrize("eta", [0.0, 40.0])
+@pytest.mark.parametrize("drive", DRIVES)
+def test_a_rate_that_no_stress_determines_is_refused(bouc_wen: Law, drive: str, eta: float) -> None:
+    """In a chain; the response was off by any size, or not finite."""
+    still = prony(2, True).make([5e6, 0.5, 0.3, 1e-4, 5e-4, 0.0], ())
+    both = [still, ff.BistableSpring(*SEVEN, eta=eta)]
+    chain = ff.Chain(both, [0.6e-3, 0.59e-3], 1.9635e-5)
+    with pytest.raises(ff.SimulationError, match="zero at any rate"):
+        ff.simulate(chain, DRIVES[drive], TIME, sensitivities=["s2_k0"])
+
+
 def _creeping(p, x, strain, branch):  # type: ignore[no-untyped-def]
     return p[0] * (strain - x[0])
 

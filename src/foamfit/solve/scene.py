@@ -24,7 +24,8 @@ _FAILURES = {
     FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
     "that nothing slows; give the top a mass or the spring a dashpot",
     NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "
-    "branch (strain 1 on branch a, 1 + eps_star on branch c)",
+    "branch (strain 1 on branch a, 1 + eps_star on branch c), or the stress by which a law in a "
+    "chain resists the strain rate is zero at any rate",
 }
 _PULLED = (FLAT_UNDER_STRESS, NOT_FINITE)  # of a unilateral spring under a prescribed tension
 

@@ -58,6 +58,7 @@ from foamfit.springs.compiled.contract import (
 from foamfit.springs.laws.record import OWN_ETA
 
 LEAST_RATE = 1e-25  # smaller strain rates are zero, 1/s
+MOST_RATE = 1e30  # larger ones mean that V vanishes, so that no stress determines the rate
 ENOUGH = 2e-15  # relative change of a rate or stress that ends Newton's method
 RAMP = 1e-9  # time of a ramp to the first sample over the duration
 
@@ -227,6 +228,9 @@ def _lose(c, i, common):  # type: ignore[no-untyped-def]
         if new in (low, high):
             return
         rate = new
+        if rate > MOST_RATE:
+            s.rate = s.loss = math.nan
+            return
         if not rate > LEAST_RATE:
             force = 0.0
 
