@@ -49,12 +49,14 @@ def as_signalled() -> Iterator[None]:
     try:
         yield
     except SystemError as error:
-        raise signalled(error) from None
+        raise_signal(error)
+        raise
 
 
-def signalled(error: SystemError) -> BaseException:
-    """Return the KeyboardInterrupt that Python has turned into a SystemError, or the error."""
+def raise_signal(error: SystemError) -> None:
+    """Raise the KeyboardInterrupt that Python has turned into a SystemError, if there is one."""
     first: BaseException | None = error
     while isinstance(first, SystemError):  # one for each nested compiled loop
         first = first.__cause__ or first.__context__
-    return error if first is None or isinstance(first, Exception) else first
+    if first is not None and not isinstance(first, Exception):
+        raise first from None

@@ -18,7 +18,7 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import INTEGRATED, Measurement, NoiseLevel
 from foamfit.data.motion import SmoothMotion
 from foamfit.data.noise import with_noise
-from foamfit.errors import InputError, SimulationError, signalled
+from foamfit.errors import InputError, SimulationError, raise_signal
 from foamfit.fitting import nuisance as nuisances
 from foamfit.fitting.curves import (
     ACCELERATION,
@@ -265,7 +265,8 @@ class Objective:
             self.spent.failures += 1
             raise
         except SystemError as error:
-            raise signalled(error) from None
+            raise_signal(error)
+            raise
         finally:
             self.spent.seconds += time.perf_counter() - began
 

@@ -18,6 +18,7 @@ from foamfit.solve.compiled.motion import (
     ONLY_DERIVATIVES,
     call_inside,
     evaluate,
+    in_contact,
     rates,
     rates_of,
 )
@@ -48,12 +49,11 @@ def _begin_piece(c, k):  # type: ignore[no-untyped-def]
     """Prescribe the drive between samples k and k + 1."""
     r, drive, t, values = c.now, c.drive, c.time, c.values
     r.now, r.begun, drive.value, drive.value_rate = 0.0, t[k], values[k], 0.0
-    r.horizon, drive.shift, drive.shift_rate = 0.0, 1.0 if values[k] > 0.0 else 0.0, 0.0
+    r.horizon, drive.shift, drive.shift_rate = 0.0, in_contact(c, k), 0.0
     if k + 1 < c.samples:
         r.horizon = t[k + 1] - t[k]
         drive.value_rate = (values[k + 1] - values[k]) / (t[k + 1] - t[k])
-        later = 1.0 if values[k + 1] > 0.0 else 0.0
-        drive.shift_rate = (later - drive.shift) / (t[k + 1] - t[k])
+        drive.shift_rate = (in_contact(c, k + 1) - drive.shift) / (t[k + 1] - t[k])
 
 
 @inner

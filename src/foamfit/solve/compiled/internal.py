@@ -29,6 +29,7 @@ from foamfit.solve.compiled.motion import (
     PATH,
     SHARE,
     evaluate,
+    in_contact,
     rates,
 )
 from foamfit.solve.compiled.run import numbers, spring, unpack
@@ -297,7 +298,7 @@ def _begin_ramp(c, want):  # type: ignore[no-untyped-def]
         masses[g], c.per_mass[g] = c.per_mass[g], 0.0
     masses[c.groups] = drive.pace
     drive.value, drive.value_rate, drive.pace = 0.0, c.values[0] / brief, 0.0
-    drive.shift, drive.shift_rate = 0.0, 1.0 / brief if c.values[0] > 0.0 else 0.0
+    drive.shift, drive.shift_rate = 0.0, in_contact(c, c.none) / brief
     for i in range(c.ends[c.groups - 2] if c.groups > 1 else c.none, c.count):
         s, n = spring(c, i), numbers(c, i)
         kept = past(aside, i * (1 + terms))

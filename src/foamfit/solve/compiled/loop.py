@@ -264,7 +264,7 @@ def _begin(c, reals):  # type: ignore[no-untyped-def]
 def _strike(c, want):  # type: ignore[no-untyped-def]
     """Fill the rates at contact; derivatives by its time and by the velocity of the striker."""
     y, p, top = c.y, c.p, c.groups - 1
-    rates(c, y, c.stage, want, 0.0)
+    rates(c, y, c.stage, c.none, 0.0)
     for j in range(p):
         what = c.directions[2 * j + 1]
         if what == STRUCK:

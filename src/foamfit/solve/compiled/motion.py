@@ -188,6 +188,12 @@ def is_alone(c, g):  # type: ignore[no-untyped-def]
     return c.ends[g] - first == 1 and (g < c.groups - 1 or c.top == FREE or c.top == MOTION)
 
 
+@inlined
+def in_contact(c, k):  # type: ignore[no-untyped-def]
+    """Return the derivative of sample k of a prescribed motion by its shift: 1 in contact."""
+    return 1.0 if c.values[k] > 0.0 else 0.0
+
+
 @inner
 def span_tangents(c, g, y, reach, rate):  # type: ignore[no-untyped-def]
     """Fill the derivatives of elongation and rate of a group, as far as its nodes tell."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from foamfit.solve.compiled.events import change_branch
-from foamfit.solve.compiled.motion import ONLY_DERIVATIVES, evaluate, rates_of
+from foamfit.solve.compiled.motion import ONLY_DERIVATIVES, evaluate, in_contact, rates_of
 from foamfit.solve.compiled.run import begin_run, numbers, spring
 from foamfit.solve.compiled.samples import is_finite, row_of
 from foamfit.solve.scene import MOTION, STRESS
@@ -226,7 +226,7 @@ def _write(c, k, now):  # type: ignore[no-untyped-def]
             s = spring(c, i)
             evaluate(c, i, 1 + c.none)
             s.tangent, s.total = s.slope, s.sigma
-        c.carried[0], c.drive.shift = now, 1.0 if c.values[k] > 0.0 else 0.0
+        c.carried[0], c.drive.shift = now, in_contact(c, k)
         rates_of(c, c.none, c.y, c.f, ONLY_DERIVATIVES, 0.0)
     row_of(c, c.none, c.none)[k] = now
     for j in range(p):
