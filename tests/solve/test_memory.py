@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import foamfit as ff
+from foamfit.solve.plan import plan
 from foamfit.springs.chain import Drive
+from foamfit.springs.parameters import direction
 from foamfit.springs.spring import Spring
 from independent import Array, follow
 
@@ -174,6 +176,28 @@ def test_a_motion_is_as_exact_as_asked_for(name: str) -> None:
         assert got.method == "Dormand-Prince"
         if truth.contact_end is not None:
             assert got.contact_end == pytest.approx(truth.contact_end, rel=rtol)
+
+
+@pytest.mark.parametrize(
+    "name", ["motion of two, relaxing", "motion of two, bistable", "stress on two, relaxing"]
+)
+def test_between_close_samples_springs_that_relax_in_series_take_one_step(name: str) -> None:
+    """The steps of `series`: far within the tolerance, with derivatives of second order."""
+    (given, drive), time = SCENES[name], np.linspace(0.0, 3e-3, 3001)
+    close = type(drive)(np.interp(time, TIME, vars(drive)[next(iter(vars(drive)))]))
+    scene = plan(given, close, time)
+    wanted = np.array([direction(given.laws, one, given.relaxation) for one in names_of(given)])
+    runs = [
+        scene.run(given.arrays.rows, given.arrays.heights, rtol, directions=wanted)
+        for rtol in (1e-4, 1e-10)
+    ]
+    truth = follow(given, drive, TIME)
+    assert difference(truth.base_stress, runs[0].base_stress[::50]) < 1e-9
+    assert max(map(difference, truth.displacement, runs[0].displacement[:, ::50])) < 1e-9
+    what = "displacement" if isinstance(drive, ff.StressDrive) else "base_stress"
+    got, exact = (getattr(run.slopes, what).reshape(len(wanted), -1) for run in runs)
+    sizes = np.abs(exact).max(axis=1)
+    assert 1e-7 < (np.abs(got - exact).max(axis=1)[sizes > 0.0] / sizes[sizes > 0.0]).max() < 2e-5
 
 
 EXACT = [

@@ -25,7 +25,7 @@ from foamfit.solve.compiled.run import (
     SYSTEMS,
     WORDS,
 )
-from foamfit.solve.scene import FREE, STRESS, VISCOUS
+from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled import compiled
 from foamfit.springs.compiled.contract import (
     BY,
@@ -143,7 +143,7 @@ def _owned(count: int, directions: list[list[int]]) -> list[int]:
 
 
 def _functions(
-    shape: Shape, integrated: bool, several: bool, internal: bool, fades: bool
+    shape: Shape, integrated: bool, several: bool, internal: bool, fades: bool, relaxes: bool
 ) -> tuple[int, ...]:
     """Return the addresses of the functions that a run needs, 0 for others (see run.ADDRESSES).
 
@@ -181,6 +181,10 @@ def _functions(
         from foamfit.solve.compiled import drive as driven
 
         drive, short = driven.next_piece.address, driven.short_step.address
+    if relaxes:
+        from foamfit.solve.compiled import series
+
+        short = series.relaxing_step.address
     rates, change = motion.compute_rates.address, events.enter_branch.address
     return rates, group, inside, change, step, advance, drive, write, fade, short
 
@@ -213,6 +217,10 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     parameters = max(one.derivatives for one in made)
     internal = any(one.kind == INTERNAL for one in made)
     fades = 0 if integrated else _memory_of_decay(made[0], p)
+    relaxes = shape.terms > 0 and shape.degree == 0 and integrated and not internal
+    relaxes = relaxes and count > groups == 1 and shape.top in (MOTION, STRESS)
+    relaxes = relaxes and not any(shape.damped)
+    relaxing = count * (3 + 8 * shape.terms) if relaxes else 0
     lengths = {
         "springs": count * width, "per_mass": groups, "drive": len(DRIVE), "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
@@ -221,7 +229,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
         "now": len(NOW), "sided": p, "stage": STAGES * wide, "line": LINE * wide, "y": wide,
         "new": wide, "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
         "batch": BATCH * (6 + BY + parameters) + 2 * p + 8 * MOST_TERMS + 8,
-        "aside": fades or (count * (1 + shape.terms) + groups + 1 if internal else 0),
+        "aside": fades or relaxing or (count * (1 + shape.terms) + groups + 1 if internal else 0),
         "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,
         "largest": p if size else 0, "kept": count * width + groups if size and p else 0,
         "systems": 2 * SYSTEMS * size * (3 * reach + 1),
@@ -237,7 +245,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     several = several or shape.top in (STRESS, VISCOUS)
     words = [
         *at[:-1], *whole[:-1], *([0] * len(GIVEN)),
-        *_functions(shape, integrated, several, internal, fades > 0),
+        *_functions(shape, integrated, several, internal, fades > 0, relaxes),
         row, width, count, groups, nodes, p, base, carries, shape.terms, shape.top,
         int(shape.solved), wide, shape.degree, reach, 0, 0, 0, 0,
     ]  # fmt: skip

@@ -1,0 +1,198 @@
+"""Springs in series that relax along a known motion or stress: steps from sample to sample.
+
+Within a step, the stress of each spring is a parabola in time: it has the stress and slope of the
+start, and the stress of the end. Relaxation terms are integrated exactly for it, see `along`, so
+that they are linear in the stress at the end. Static equilibrium with another gain and an offset
+of each spring then gives that stress. The slope at the end adds a cubic term, which corrects the
+relaxation terms and is the error estimate. The slopes of derivatives are unknown: these are linear
+within a step, and what the parabola adds to a straight line bounds their error.
+"""
+
+from __future__ import annotations
+
+import math
+
+from foamfit.solve.compiled.along import OF_STEP, TABLE, tabulate
+from foamfit.solve.compiled.drive import PAUSE
+from foamfit.solve.compiled.events import MIDDLE, suspicious
+from foamfit.solve.compiled.explicit import SHORTENING
+from foamfit.solve.compiled.motion import ONLY_DERIVATIVES, evaluate, rates, rates_of
+from foamfit.solve.compiled.run import STEPPED, numbers, spring, unpack
+from foamfit.solve.compiled.static import strain_at
+from foamfit.solve.scene import STRESS
+from foamfit.springs.compiled.contract import RELAX, inner, past, pointed
+from foamfit.springs.laws.record import OWN_RELAXATION
+
+# Memory of a spring, see `layout`: stress at the start, its change at the slope of the start,
+# stress at the end. Then the table of each relaxation term.
+FIRST, LOW, LAST, TABLES = range(4)
+TRIALS, NEAR = 4, 1e-7  # of Newton's method; relative elongation that a last step of it corrects
+ROUNDED = 1e-9  # difference between the stresses of two springs over their scale
+# Largest cubic term over the tolerance, as its own error is of higher order; largest parabola
+# where derivatives are computed.
+CUBIC, LINEAR = 2.0, 10.0
+# The strain rate at MIDDLE follows from the rise of the strain and the rates at both ends.
+RISE, EARLY, LATE = (
+    6.0 * MIDDLE * (1.0 - MIDDLE), (1.0 - MIDDLE) * (1.0 - 3.0 * MIDDLE),
+    MIDDLE * (3.0 * MIDDLE - 2.0),
+)  # fmt: skip
+
+
+@inner
+def _memory(c, i):  # type: ignore[no-untyped-def]
+    """Return the memory of a spring."""
+    return past(c.aside, i * (TABLES + c.terms * TABLE))
+
+
+@inner
+def _prepare(c, h):  # type: ignore[no-untyped-def]
+    """Fill what the terms at the end of a step owe to its start, and gain and offset of each T.
+
+    Return whether no spring is on a flat branch.
+    """
+    y, new, p, steep = c.y, c.new, c.p, True
+    for i in range(c.count):
+        s, n, m = spring(c, i), numbers(c, i), _memory(c, i)
+        steep = steep and s.slope > 0.0 and s.sigma_low < s.sigma_high
+        m[FIRST], m[LOW] = s.sigma, s.slope * s.rate * h
+        s.gain, s.offset = 1.0, 0.0
+        part, strain = past(c.part, i * p), past(c.strain, i * p)
+        for k in range(c.terms):
+            g, a, at = s[RELAX + 2 * k], past(m, TABLES + k * TABLE), n.z_at + k
+            x = h / s[RELAX + 2 * k + 1]
+            if abs(h - a[OF_STEP]) > 1e-13 * h:
+                tabulate(x, h, a)
+            decay = math.exp(-x)
+            new[at] = decay * y[at] - x * (m[FIRST] * (a[0] - a[2]) + m[LOW] * (a[1] - a[2]))
+            s.gain += g * (1.0 - x * a[2])
+            s.offset += g * new[at]
+            before, after = past(y, c.base + at * p), past(new, c.base + at * p)
+            for j in range(p):
+                change = s.slope * strain[j] + part[j]
+                after[j] = decay * before[j] - x * (a[0] - a[1]) * change
+    return steep
+
+
+@inner
+def _restore(c):  # type: ignore[no-untyped-def]
+    """Give the springs back their own gains."""
+    for i in range(c.count):
+        s = spring(c, i)
+        s.gain, s.offset = 1.0, 0.0
+        for k in range(c.terms):
+            s.gain += s[RELAX + 2 * k]
+
+
+@inner
+def _balance(c, h):  # type: ignore[no-untyped-def]
+    """Fill strains and stresses at the end of a step, and the terms; return the common stress.
+
+    Newton's method begins at the stress that the rates at the start predict.
+    """
+    new, s, end, gain = c.new, c.springs, c.drive.value + c.drive.value_rate * h, 1.0
+    for k in range(c.terms):
+        gain += s[RELAX + 2 * k]
+    pushed, change = c.top == STRESS, 0.0
+    common = end if pushed else c.carried[0] + gain * c.aside[LOW] + s.drift * h
+    for _ in range(TRIALS):
+        miss, compliance, size = -end, 0.0, abs(end)
+        for i in range(c.count):
+            s = spring(c, i)
+            s.eps = strain_at(c, i, common)
+            miss += s.height * s.eps
+            compliance += s.height * s.soft / s.gain
+            size += s.height * abs(s.eps)
+        if pushed:
+            break
+        change = -miss / compliance
+        common += change
+        if abs(miss) <= NEAR * size:
+            break
+    for i in range(c.count):
+        s, n, m = spring(c, i), numbers(c, i), _memory(c, i)
+        m[LAST] = (common - s.offset) / s.gain
+        new[n.eps_at] = s.eps + s.soft / s.gain * change
+        if n.x_at >= 0:
+            new[n.x_at] = m[LAST]
+        for k in range(c.terms):
+            x = h / s[RELAX + 2 * k + 1]
+            new[n.z_at + k] -= x * m[TABLES + k * TABLE + 2] * m[LAST]
+    return common
+
+
+@inner
+def _correct(c, h, want, tol, common):  # type: ignore[no-untyped-def]
+    """Add the cubic terms; return the largest error over the one that is allowed."""
+    y, new, error, balanced = c.y, c.new, 0.0, True
+    least = LINEAR * tol if want else math.inf
+    for i in range(c.count):
+        s, n, m = spring(c, i), numbers(c, i), _memory(c, i)
+        most = max(abs(common), c.now.largest)
+        balanced = balanced and abs(s.total - common) <= ROUNDED * most
+        square = m[LAST] - m[FIRST] - m[LOW]
+        cube = s.slope * s.rate * h - m[LOW] - 2.0 * square
+        for k in range(c.terms):
+            g, a, at = s[RELAX + 2 * k], past(m, TABLES + k * TABLE), n.z_at + k
+            x = h / s[RELAX + 2 * k + 1]
+            more, bend = x * cube * (a[2] - a[3]), x * square * (a[1] - a[2])
+            size = max(c.scales[c.kinds[at]], max(abs(y[at]), abs(new[at])))
+            new[at] += more
+            s.total += g * more
+            if size > 0.0:
+                error = max(error, max(abs(more) / (CUBIC * tol), abs(bend) / least) / size)
+        s.midway = RISE * (s.eps - s.old_eps) / h + EARLY * s.old_rate + LATE * s.rate
+    return error if balanced else math.inf
+
+
+@inner
+def _derive(c, h):  # type: ignore[no-untyped-def]
+    """Fill the derivatives of the relaxation terms at the end of a step."""
+    new, p = c.new, c.p
+    for i in range(c.count):
+        s, n, m = spring(c, i), numbers(c, i), _memory(c, i)
+        evaluate(c, i, 1 + c.none)
+        first, low, square = m[FIRST], m[LOW], m[LAST] - m[FIRST] - m[LOW]
+        for k in range(c.terms):
+            a, tau, at = past(m, TABLES + k * TABLE), s[RELAX + 2 * k + 1], n.z_at + k
+            x, after, what = h / tau, past(new, c.base + at * p), OWN_RELAXATION + 2 * k + 1
+            s.gain -= s[RELAX + 2 * k] * x * a[1]
+            total = first * a[0] + low * a[1] + square * a[2]
+            change = first * (a[1] - a[0]) + low * (a[2] - a[1]) + square * (a[3] - a[2])
+            for j in range(p):
+                if c.directions[2 * j] == i and c.directions[2 * j + 1] == what:
+                    after[j] += (math.exp(-x) * c.y[at] + total + x * change) * x / tau
+    rates_of(c, c.none, new, c.f, ONLY_DERIVATIVES, h)
+    for i in range(c.count):
+        s, n, m = spring(c, i), numbers(c, i), _memory(c, i)
+        part, strain = past(c.part, i * p), past(c.strain, i * p)
+        for k in range(c.terms):
+            after = past(new, c.base + (n.z_at + k) * p)
+            weight = h / s[RELAX + 2 * k + 1] * m[TABLES + k * TABLE + 1]
+            for j in range(p):
+                after[j] -= weight * (s.slope * strain[j] + part[j])
+    _restore(c)
+
+
+@pointed(SHORTENING)
+def relaxing_step(words, want, tol):  # type: ignore[no-untyped-def]
+    """Try one step over a whole piece of the drive; return whether it was taken."""
+    c = unpack(words)
+    r, h = c.now, c.now.step
+    if r.now != 0.0 or h != r.horizon or not h > 0.0:
+        return c.none
+    r.paused -= 1.0
+    if r.paused >= 0.0:
+        return c.none
+    steep, error = _prepare(c, h), math.inf
+    common = _balance(c, h) if steep else 0.0
+    _restore(c)
+    if steep:
+        rates(c, c.new, past(c.stage, STEPPED * c.wide), c.none, h)
+        error = _correct(c, h, want, tol, common)
+    if error <= 1.0 and not suspicious(c, h):
+        if want:
+            _derive(c, h)
+        r.taken, r.grow = r.taken + 1.0, 6.0
+        return 1 + c.none
+    r.paused = PAUSE
+    return c.none
