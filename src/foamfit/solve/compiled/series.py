@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 
 from foamfit.solve.compiled.along import OF_STEP, TABLE, tabulate
-from foamfit.solve.compiled.drive import PAUSE
 from foamfit.solve.compiled.events import MIDDLE, suspicious
 from foamfit.solve.compiled.explicit import SHORTENING
 from foamfit.solve.compiled.motion import ONLY_DERIVATIVES, evaluate, rates, rates_of
@@ -26,6 +25,7 @@ from foamfit.springs.laws.record import OWN_RELAXATION
 # Memory of a spring, see `layout`: stress at the start, its change at the slope of the start,
 # stress at the end. Then the table of each relaxation term.
 FIRST, LOW, LAST, TABLES = range(4)
+PAUSE = 2  # steps without an attempt after one that was not accurate
 TRIALS, NEAR = 4, 1e-7  # of Newton's method; relative elongation that a last step of it corrects
 ROUNDED = 1e-9  # difference between the stresses of two springs over their scale
 # Largest cubic term over the tolerance, as its own error is of higher order; largest parabola
@@ -175,10 +175,10 @@ def _derive(c, h):  # type: ignore[no-untyped-def]
 
 @pointed(SHORTENING)
 def relaxing_step(words, want, tol):  # type: ignore[no-untyped-def]
-    """Try one step over a whole piece of the drive; return whether it was taken."""
+    """Try one step over a whole piece of the drive, of any length; return whether it was taken."""
     c = unpack(words)
-    r, h = c.now, c.now.step
-    if r.now != 0.0 or h != r.horizon or not h > 0.0:
+    r, h = c.now, c.now.horizon
+    if r.now != 0.0 or not h > 0.0:
         return c.none
     r.paused -= 1.0
     if r.paused >= 0.0:
@@ -192,7 +192,7 @@ def relaxing_step(words, want, tol):  # type: ignore[no-untyped-def]
     if error <= 1.0 and not suspicious(c, h):
         if want:
             _derive(c, h)
-        r.taken, r.grow = r.taken + 1.0, 6.0
+        r.step, r.taken, r.grow = h, r.taken + 1.0, 6.0
         return 1 + c.none
     r.paused = PAUSE
     return c.none
