@@ -104,6 +104,9 @@ SCENES: dict[str, tuple[ff.Chain, Drive]] = {
     "stress, viscous top": (chain([relaxing(FOAM), MICRO], site=1e3), stress(2e6)),
     "stress on a mass": (chain([relaxing(FOAM), MICRO], [0.0, 1e-4]), stress(1.5e6)),
     "stress, bistable relaxing": (chain([relaxing(BISTABLE)]), stress(5e6)),
+    # Trial steps that are far too long must not decide that a branch is flat.
+    "stress on two, bistable, fast term": (
+        chain([relaxing(BISTABLE, [(1.7, 1e-6)]), relaxing(FOAM)]), stress(1.5e6)),
     "impact, remembering": (chain([WORN]), IMPACT),
     "impact, remembering, relaxation, dashpot": (chain([damped(relaxing(STIFF), 60.0)]), IMPACT),
     "impact, remembering, interior mass": (chain([WORN, relaxing(LATE)], [3e-3, 0.0]), IMPACT),

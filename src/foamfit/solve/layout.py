@@ -220,7 +220,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     relaxes = shape.terms > 0 and shape.degree == 0 and integrated and not internal
     relaxes = relaxes and count > groups == 1 and shape.top in (MOTION, STRESS)
     relaxes = relaxes and not any(shape.damped)
-    relaxing = count * (3 + 8 * shape.terms) if relaxes else 0
+    relaxing = count * (5 + 8 * shape.terms) if relaxes else 0
     lengths = {
         "springs": count * width, "per_mass": groups, "drive": len(DRIVE), "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,

@@ -168,8 +168,8 @@ def share_rate(c, g, i0, i1, rate, loose, flat, pushed, lossy):  # type: ignore[
         climb = rest / soft
     elif not pushed:
         climb = spring(c, flat).drift
-    elif flat >= 0:
-        c.drive.flat = 1.0
+    if pushed:  # the last values of a step decide: those of a trial may be anywhere
+        c.drive.flat = 1.0 if flat >= 0 else 0.0
     for i in range(i0, i1):
         s = spring(c, i)
         if s.eta == 0.0 and i != flat:

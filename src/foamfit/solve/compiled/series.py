@@ -1,4 +1,4 @@
-"""Springs in series that relax along a known motion or stress: steps from sample to sample.
+"""Springs in series that relax along a known motion or stress: few steps from sample to sample.
 
 Within a step, the stress of each spring is a parabola in time: it has the stress and slope of the
 start, and the stress of the end. Relaxation terms are integrated exactly for it, see `along`, so
@@ -22,15 +22,16 @@ from foamfit.solve.scene import STRESS
 from foamfit.springs.compiled.contract import RELAX, inner, past, pointed
 from foamfit.springs.laws.record import OWN_RELAXATION
 
-# Memory of a spring, see `layout`: stress at the start, its change at the slope of the start,
-# stress at the end. Then the table of each relaxation term.
-FIRST, LOW, LAST, TABLES = range(4)
-PAUSE = 2  # steps without an attempt after one that was not accurate
-TRIALS, NEAR = 4, 1e-7  # of Newton's method; relative elongation that a last step of it corrects
+# Memory of a spring, see `layout`: stress, slope, strain rate and drift at the start of a step, the
+# stress at its end. Then the table of each relaxation term.
+FIRST, STEEP, RATE, DRIFT, LAST, TABLES = range(6)
+NEAR, TRIALS = 1e-7, 4  # relative elongation that a last step of Newton's method corrects; steps
 ROUNDED = 1e-9  # difference between the stresses of two springs over their scale
-# Largest cubic term over the tolerance, as its own error is of higher order; largest parabola
-# where derivatives are computed.
-CUBIC, LINEAR = 2.0, 10.0
+# Largest cubic term over the tolerance, as its own error is of higher order. Largest parabola where
+# derivatives are computed, over its power: a search needs fewer digits of them than a simulation.
+CUBIC, PARABOLA, POWER = 2.0, 2e4, 1.5
+SHORTEST = 0.15  # share of the rest of a piece; shorter steps would cost more than one of order 8
+PAUSE = 2  # steps without an attempt after one that was not accurate
 # The strain rate at MIDDLE follows from the rise of the strain and the rates at both ends.
 RISE, EARLY, LATE = (
     6.0 * MIDDLE * (1.0 - MIDDLE), (1.0 - MIDDLE) * (1.0 - 3.0 * MIDDLE),
@@ -45,32 +46,36 @@ def _memory(c, i):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _prepare(c, h):  # type: ignore[no-untyped-def]
-    """Fill what the terms at the end of a step owe to its start, and gain and offset of each T.
+def _keep(c):  # type: ignore[no-untyped-def]
+    """Keep the values at the start of a step; return whether no spring is on a flat branch."""
+    steep = True
+    for i in range(c.count):
+        s, m = spring(c, i), _memory(c, i)
+        steep = steep and s.slope > 0.0 and s.sigma_low < s.sigma_high
+        m[FIRST], m[STEEP], m[RATE], m[DRIFT] = s.sigma, s.slope, s.rate, s.drift
+    return steep
 
-    Return whether no spring is on a flat branch.
-    """
-    y, new, p, steep = c.y, c.new, c.p, True
+
+@inner
+def _prepare(c, h):  # type: ignore[no-untyped-def]
+    """Fill what the terms at the end of a step owe to its start, and gain and offset of each T."""
+    y, new, p = c.y, c.new, c.p
     for i in range(c.count):
         s, n, m = spring(c, i), numbers(c, i), _memory(c, i)
-        steep = steep and s.slope > 0.0 and s.sigma_low < s.sigma_high
-        m[FIRST], m[LOW] = s.sigma, s.slope * s.rate * h
-        s.gain, s.offset = 1.0, 0.0
-        part, strain = past(c.part, i * p), past(c.strain, i * p)
+        s.gain, s.offset, low = 1.0, 0.0, m[STEEP] * m[RATE] * h
+        part, strain, slope = past(c.part, i * p), past(c.strain, i * p), m[STEEP]
         for k in range(c.terms):
             g, a, at = s[RELAX + 2 * k], past(m, TABLES + k * TABLE), n.z_at + k
             x = h / s[RELAX + 2 * k + 1]
             if abs(h - a[OF_STEP]) > 1e-13 * h:
                 tabulate(x, h, a)
             decay = math.exp(-x)
-            new[at] = decay * y[at] - x * (m[FIRST] * (a[0] - a[2]) + m[LOW] * (a[1] - a[2]))
+            new[at] = decay * y[at] - x * (m[FIRST] * (a[0] - a[2]) + low * (a[1] - a[2]))
             s.gain += g * (1.0 - x * a[2])
             s.offset += g * new[at]
             before, after = past(y, c.base + at * p), past(new, c.base + at * p)
             for j in range(p):
-                change = s.slope * strain[j] + part[j]
-                after[j] = decay * before[j] - x * (a[0] - a[1]) * change
-    return steep
+                after[j] = decay * before[j] - x * (a[0] - a[1]) * (slope * strain[j] + part[j])
 
 
 @inner
@@ -84,16 +89,17 @@ def _restore(c):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _balance(c, h):  # type: ignore[no-untyped-def]
+def _balance(c, h, first):  # type: ignore[no-untyped-def]
     """Fill strains and stresses at the end of a step, and the terms; return the common stress.
 
-    Newton's method begins at the stress that the rates at the start predict.
+    Newton's method begins at the stress that the `first` one and the rates at the start predict.
     """
-    new, s, end, gain = c.new, c.springs, c.drive.value + c.drive.value_rate * h, 1.0
+    new, s, m, gain = c.new, c.springs, _memory(c, c.none), 1.0
+    end = c.drive.value + c.drive.value_rate * (c.now.now + h)
     for k in range(c.terms):
         gain += s[RELAX + 2 * k]
     pushed, change = c.top == STRESS, 0.0
-    common = end if pushed else c.carried[0] + gain * c.aside[LOW] + s.drift * h
+    common = end if pushed else first + (gain * m[STEEP] * m[RATE] + m[DRIFT]) * h
     for _ in range(TRIALS):
         miss, compliance, size = -end, 0.0, abs(end)
         for i in range(c.count):
@@ -124,13 +130,14 @@ def _balance(c, h):  # type: ignore[no-untyped-def]
 def _correct(c, h, want, tol, common):  # type: ignore[no-untyped-def]
     """Add the cubic terms; return the largest error over the one that is allowed."""
     y, new, error, balanced = c.y, c.new, 0.0, True
-    least = LINEAR * tol if want else math.inf
+    least = PARABOLA * tol**POWER if want else math.inf
     for i in range(c.count):
         s, n, m = spring(c, i), numbers(c, i), _memory(c, i)
         most = max(abs(common), c.now.largest)
         balanced = balanced and abs(s.total - common) <= ROUNDED * most
-        square = m[LAST] - m[FIRST] - m[LOW]
-        cube = s.slope * s.rate * h - m[LOW] - 2.0 * square
+        low = m[STEEP] * m[RATE] * h
+        square = m[LAST] - m[FIRST] - low
+        cube = s.slope * s.rate * h - low - 2.0 * square
         for k in range(c.terms):
             g, a, at = s[RELAX + 2 * k], past(m, TABLES + k * TABLE), n.z_at + k
             x = h / s[RELAX + 2 * k + 1]
@@ -151,7 +158,8 @@ def _derive(c, h):  # type: ignore[no-untyped-def]
     for i in range(c.count):
         s, n, m = spring(c, i), numbers(c, i), _memory(c, i)
         evaluate(c, i, 1 + c.none)
-        first, low, square = m[FIRST], m[LOW], m[LAST] - m[FIRST] - m[LOW]
+        first, low = m[FIRST], m[STEEP] * m[RATE] * h
+        square = m[LAST] - first - low
         for k in range(c.terms):
             a, tau, at = past(m, TABLES + k * TABLE), s[RELAX + 2 * k + 1], n.z_at + k
             x, after, what = h / tau, past(new, c.base + at * p), OWN_RELAXATION + 2 * k + 1
@@ -161,7 +169,7 @@ def _derive(c, h):  # type: ignore[no-untyped-def]
             for j in range(p):
                 if c.directions[2 * j] == i and c.directions[2 * j + 1] == what:
                     after[j] += (math.exp(-x) * c.y[at] + total + x * change) * x / tau
-    rates_of(c, c.none, new, c.f, ONLY_DERIVATIVES, h)
+    rates_of(c, c.none, new, c.f, ONLY_DERIVATIVES, c.now.now + h)
     for i in range(c.count):
         s, n, m = spring(c, i), numbers(c, i), _memory(c, i)
         part, strain = past(c.part, i * p), past(c.strain, i * p)
@@ -173,26 +181,38 @@ def _derive(c, h):  # type: ignore[no-untyped-def]
     _restore(c)
 
 
+@inner
+def _try(c, h, want, tol, first):  # type: ignore[no-untyped-def]
+    """Fill the state at the end of a step; return the largest error over the one allowed."""
+    _prepare(c, h)
+    common = _balance(c, h, first)
+    _restore(c)
+    rates(c, c.new, past(c.stage, STEPPED * c.wide), c.none, c.now.now + h)
+    return _correct(c, h, want, tol, common)
+
+
 @pointed(SHORTENING)
 def relaxing_step(words, want, tol):  # type: ignore[no-untyped-def]
-    """Try one step over a whole piece of the drive, of any length; return whether it was taken."""
+    """Try one step up to the next sample, or a shorter one; return whether it was taken."""
     c = unpack(words)
-    r, h = c.now, c.now.horizon
-    if r.now != 0.0 or not h > 0.0:
-        return c.none
+    r, first = c.now, c.carried[0]
+    rest = r.horizon - r.now
     r.paused -= 1.0
-    if r.paused >= 0.0:
+    if r.paused >= 0.0 or not rest > 0.0 or not _keep(c):
         return c.none
-    steep, error = _prepare(c, h), math.inf
-    common = _balance(c, h) if steep else 0.0
-    _restore(c)
-    if steep:
-        rates(c, c.new, past(c.stage, STEPPED * c.wide), c.none, h)
-        error = _correct(c, h, want, tol, common)
-    if error <= 1.0 and not suspicious(c, h):
-        if want:
-            _derive(c, h)
-        r.step, r.taken, r.grow = h, r.taken + 1.0, 6.0
-        return 1 + c.none
-    r.paused = PAUSE
-    return c.none
+    h = min(max(r.step, SHORTEST * rest), rest)
+    while h >= SHORTEST * rest:
+        error = _try(c, h, want, tol, first)
+        if error <= 1.0:
+            break
+        h *= max(0.2, 0.8 * error ** (-1.0 / 3.0)) if error < math.inf else 0.0
+    if h < SHORTEST * rest or suspicious(c, h):
+        r.paused = PAUSE
+        return c.none
+    if want:
+        _derive(c, h)
+    r.step, r.taken = h, r.taken + 1.0
+    r.grow = min(6.0, 0.8 * max(error, 1e-6) ** (-1.0 / 3.0))
+    if h < rest:  # else the next piece does it
+        rates(c, c.new, past(c.stage, STEPPED * c.wide), want, r.now + h)
+    return 1 + c.none
