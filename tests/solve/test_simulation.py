@@ -446,6 +446,27 @@ def test_contact_ends_wherever_in_the_chain_a_gap_opens(speed: float) -> None:
         np.testing.assert_allclose(b, a, rtol=0, atol=1e-8 * np.ptp(a))
 
 
+@pytest.mark.parametrize(
+    ("more", "mass"),
+    [({"relaxation": [(0.5, 0.01)]}, 0.0), ({"eta": 10.0}, 0.0), ({}, 2e-4), ({"eta": 10.0}, 2e-4)],
+    ids=["relaxation", "dashpot", "mass", "dashpot, mass"],
+)
+@pytest.mark.parametrize("samples", [61, 439])
+def test_a_gap_stays_closed_while_the_stress_rests_at_zero(
+    more: dict[str, Any], mass: float, samples: int
+) -> None:
+    """A prescribed stress that never pulls, and rests at zero: as without a gap."""
+    below = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 1.3e6, 0.4, 5.5e5, 0.6, **more)
+    t = np.linspace(0.0, 0.3, samples)
+    drive = ff.StressDrive(np.maximum(4e4 * np.sin(np.pi * t / 0.1) ** 2 - 1e4, 0.0))
+    with_gap, without = (
+        ff.simulate(ff.Chain([below, one], [1.9e-3, 1.7e-3], 2e-5, [mass, 0.0]), drive, t)
+        for one in (Linear(2e5, unilateral=True), Linear(2e5))
+    )
+    wanted = without.displacement
+    assert np.abs(with_gap.displacement - wanted).max() < 1e-6 * np.ptp(wanted)
+
+
 @pytest.mark.parametrize("eta", [0.0, 20.0])
 def test_a_stress_that_a_spring_cannot_carry_is_refused(eta: float) -> None:
     """Also at the first sample, where the dashpot of the other spring could bear the stress.

@@ -169,7 +169,10 @@ def share_rate(c, g, i0, i1, rate, loose, flat, pushed, lossy):  # type: ignore[
     elif not pushed:
         climb = spring(c, flat).drift
     if pushed:  # the last values of a step decide: those of a trial may be anywhere
-        c.drive.flat = 1.0 if flat >= 0 else 0.0
+        c.drive.flat = 0.0
+        if flat >= 0:  # it stands at its own stress, like an open gap under none
+            off, most = abs(common - spring(c, flat).total), max(abs(common), c.now.largest)
+            c.drive.flat = 1.0 if off > MOVES * most else 0.0
     for i in range(i0, i1):
         s = spring(c, i)
         if s.eta == 0.0 and i != flat:

@@ -11,6 +11,7 @@ from foamfit.solve.compiled.events import (
     PLAIN,
     RELEASE,
     RISEN,
+    ROUNDED,
     TOP_END,
     TURN,
     change_branch,
@@ -32,7 +33,14 @@ from foamfit.solve.compiled.run import (
     unpack,
 )
 from foamfit.solve.compiled.samples import approach, fly, is_finite, write_inside
-from foamfit.solve.scene import DONE, FLAT_UNDER_STRESS, NOT_FINITE, STEP_UNDERFLOW, TOO_MANY_STEPS
+from foamfit.solve.scene import (
+    DONE,
+    FLAT_UNDER_STRESS,
+    NOT_FINITE,
+    STEP_UNDERFLOW,
+    STRESS,
+    TOO_MANY_STEPS,
+)
 from foamfit.springs.compiled.contract import (
     BY,
     BY_STRESS,
@@ -152,6 +160,16 @@ def _switch(c, i, up, want):  # type: ignore[no-untyped-def]
 
 
 @inner
+def _leaves(c, i):  # type: ignore[no-untyped-def]
+    """Whether a spring at an end of a flat branch leaves it, as a prescribed stress changes."""
+    s, way = spring(c, i), c.drive.value_rate
+    if c.top != STRESS or s.eta > 0.0 or s.sigma_low < s.sigma_high:
+        return False
+    first, end = c.ends[c.groups - 2] if c.groups > 1 else c.none, s.high if way > 0.0 else s.low
+    return i >= first and way != 0.0 and abs(s.eps - end) < ROUNDED
+
+
+@inner
 def _turn(c, want, changed):  # type: ignore[no-untyped-def]
     """Let springs turn whose rate has changed its sign by a jump.
 
@@ -165,6 +183,9 @@ def _turn(c, want, changed):  # type: ignore[no-untyped-def]
             jumps = changed < 0 or (i != changed and s.eta == 0.0)
             if jumps and s.turns * s.rate < 0.0:
                 _switch(c, i, int(s.turns < 0.0), want)
+                turned = True
+            elif changed < 0 and _leaves(c, i):
+                _switch(c, i, int(c.drive.value_rate > 0.0), want)
                 turned = True
         if not turned:
             return
