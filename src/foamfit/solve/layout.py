@@ -194,6 +194,13 @@ def _memory_of_decay(one: Compiled, p: int) -> int:
     return one.internal * (11 + 2 * 8 + 4 * p) if one.flows == FADES else 0
 
 
+def _memory_of_relaxation(shape: Shape) -> int:
+    """Return the length of the memory of `series`, 0 if a scene needs other steps."""
+    count, known = len(shape.laws), shape.top in (MOTION, STRESS)
+    needed = shape.terms > 0 and shape.degree == 0 and count > 1 and len(shape.ends) == 1
+    return count * (5 + 8 * shape.terms) if needed and known and not any(shape.damped) else 0
+
+
 @lru_cache(maxsize=1024)
 def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     """Lay out a run; `integrated` is whether it takes steps in time."""
@@ -217,10 +224,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     parameters = max(one.derivatives for one in made)
     internal = any(one.kind == INTERNAL for one in made)
     fades = 0 if integrated else _memory_of_decay(made[0], p)
-    relaxes = shape.terms > 0 and shape.degree == 0 and integrated and not internal
-    relaxes = relaxes and count > groups == 1 and shape.top in (MOTION, STRESS)
-    relaxes = relaxes and not any(shape.damped)
-    relaxing = count * (5 + 8 * shape.terms) if relaxes else 0
+    relaxes = 0 if internal or not integrated else _memory_of_relaxation(shape)
     lengths = {
         "springs": count * width, "per_mass": groups, "drive": len(DRIVE), "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
@@ -229,7 +233,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
         "now": len(NOW), "sided": p, "stage": STAGES * wide, "line": LINE * wide, "y": wide,
         "new": wide, "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
         "batch": BATCH * (6 + BY + parameters) + 2 * p + 8 * MOST_TERMS + 8,
-        "aside": fades or relaxing or (count * (1 + shape.terms) + groups + 1 if internal else 0),
+        "aside": fades or relaxes or (count * (1 + shape.terms) + groups + 1 if internal else 0),
         "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,
         "largest": p if size else 0, "kept": count * width + groups if size and p else 0,
         "systems": 2 * SYSTEMS * size * (3 * reach + 1),
@@ -245,7 +249,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     several = several or shape.top in (STRESS, VISCOUS)
     words = [
         *at[:-1], *whole[:-1], *([0] * len(GIVEN)),
-        *_functions(shape, integrated, several, internal, fades > 0, relaxes),
+        *_functions(shape, integrated, several, internal, fades > 0, relaxes > 0),
         row, width, count, groups, nodes, p, base, carries, shape.terms, shape.top,
         int(shape.solved), wide, shape.degree, reach, 0, 0, 0, 0,
     ]  # fmt: skip
