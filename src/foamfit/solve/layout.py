@@ -194,11 +194,12 @@ def _memory_of_decay(one: Compiled, p: int) -> int:
     return one.internal * (11 + 2 * 8 + 4 * p) if one.flows == FADES else 0
 
 
-def _memory_of_relaxation(shape: Shape) -> int:
+def _memory_of_relaxation(shape: Shape, allowed: bool) -> int:
     """Return the length of the memory of `series`, 0 if a scene needs other steps."""
     count, known = len(shape.laws), shape.top in (MOTION, STRESS)
     needed = shape.terms > 0 and shape.degree == 0 and count > 1 and len(shape.ends) == 1
-    return count * (5 + 8 * shape.terms) if needed and known and not any(shape.damped) else 0
+    needed = needed and allowed and known and not any(shape.damped)
+    return count * (5 + 8 * shape.terms) if needed else 0
 
 
 @lru_cache(maxsize=1024)
@@ -224,7 +225,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     parameters = max(one.derivatives for one in made)
     internal = any(one.kind == INTERNAL for one in made)
     fades = 0 if integrated else _memory_of_decay(made[0], p)
-    relaxes = 0 if internal or not integrated else _memory_of_relaxation(shape)
+    relaxes = _memory_of_relaxation(shape, integrated and not internal)
     lengths = {
         "springs": count * width, "per_mass": groups, "drive": len(DRIVE), "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
@@ -233,7 +234,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
         "now": len(NOW), "sided": p, "stage": STAGES * wide, "line": LINE * wide, "y": wide,
         "new": wide, "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
         "batch": BATCH * (6 + BY + parameters) + 2 * p + 8 * MOST_TERMS + 8,
-        "aside": fades or relaxes or (count * (1 + shape.terms) + groups + 1 if internal else 0),
+        "aside": max(fades, relaxes, internal * (count * (1 + shape.terms) + groups + 1)),
         "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,
         "largest": p if size else 0, "kept": count * width + groups if size and p else 0,
         "systems": 2 * SYSTEMS * size * (3 * reach + 1),
