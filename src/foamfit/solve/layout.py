@@ -180,7 +180,7 @@ def _functions(
     if integrated and not shape.struck:
         from foamfit.solve.compiled import drive as driven
 
-        drive, short = driven.next_piece.address, driven.short_step.address
+        drive = driven.next_piece.address
     if relaxes:
         from foamfit.solve.compiled import series
 
@@ -197,7 +197,7 @@ def _memory_of_decay(one: Compiled, p: int) -> int:
 def _memory_of_relaxation(shape: Shape, allowed: bool) -> int:
     """Return the length of the memory of `series`, 0 if a scene needs other steps."""
     count, known = len(shape.laws), shape.top in (MOTION, STRESS)
-    needed = shape.terms > 0 and shape.degree == 0 and count > 1 and len(shape.ends) == 1
+    needed = shape.terms > 0 and shape.degree == 0 and len(shape.ends) == 1
     needed = needed and allowed and known and not any(shape.damped)
     return count * (5 + 8 * shape.terms) if needed else 0
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.integrate import RK23
 from scipy.integrate._ivp import dop853_coefficients as pair
 
 from foamfit.solve.compiled.events import (
@@ -48,12 +47,8 @@ _A[STEPPED, :STEPPED] = pair.B
 # Coefficients without zeros: stage s is the sum of WEIGHT[k] K[FROM[k]] for FIRST[s] <= k <
 # FIRST[s+1]; after the stages come the four higher terms of the dense output, and the errors of
 # order 5 and 3.
-_FULL = np.zeros((26, ALL_STAGES))
+_FULL = np.zeros((22, ALL_STAGES))
 _FULL[:16], _FULL[16:20], _FULL[20, :13], _FULL[21, :13] = _A, pair.D, pair.E5, pair.E3
-# Those of the pair of order 3(2): two stages, the end of the step, the error of order 2.
-SHORT = 22
-_FULL[SHORT, 0], _FULL[SHORT + 1, 1], _FULL[SHORT + 2, :3] = 1 / 2, 3 / 4, RK23.B
-_FULL[SHORT + 3, [0, 1, 2, STEPPED]] = RK23.E
 _ROWS = [np.flatnonzero(row) for row in _FULL]
 NONE = np.array([-row.size % 4 for row in _ROWS])  # zeros at the end of a row
 _ROWS = [

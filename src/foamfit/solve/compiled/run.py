@@ -112,8 +112,8 @@ DRIVE = (
 # length of the piece, steps, growth of the next step, largest stress, whether the base stress has
 # risen, last error, next sample, number of the piece, switches; of implicit steps: length of the
 # one before, least length that the error can enforce, length of a short step, short steps in a row,
-# size of all vibrations that were damped out, and of those in the last steps; of explicit steps
-# along a drive: steps without an attempt at order 3; share of the step that the values belong to.
+# size of all vibrations that were damped out, and of those in the last steps; steps without an
+# attempt of `series`; share of the step that the values belong to.
 NOW = (
     "now", "begun", "step", "horizon", "taken", "grow", "largest", "pressed", "last", "sample",
     "piece", "logged", "before", "floor", "brief", "in_row", "damped", "damping", "paused", "seen",

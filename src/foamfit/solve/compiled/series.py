@@ -1,4 +1,4 @@
-"""Springs in series that relax along a known motion or stress: few steps from sample to sample.
+"""Springs that relax, in series or under a known stress: few steps from sample to sample.
 
 Within a step, the stress of each spring is a parabola in time: it has the stress and slope of the
 start, and the stress of the end. Relaxation terms are integrated exactly for it, see `along`, so
