@@ -25,7 +25,9 @@ from foamfit.springs.laws.record import OWN_RELAXATION
 # Memory of a spring, see `layout`: stress, slope, strain rate and drift at the start of a step, the
 # stress at its end. Then the table of each relaxation term.
 FIRST, STEEP, RATE, DRIFT, LAST, TABLES = range(6)
-NEAR, TRIALS = 1e-7, 4  # relative elongation that a last step of Newton's method corrects; steps
+# Newton's method: relative elongation that a last step corrects, at most and over the tolerance, and
+# number of steps.
+NEAR, CLOSE, TRIALS = 1e-7, 100.0, 4
 ROUNDED = 1e-9  # difference between the stresses of two springs over their scale
 # Largest cubic term over the tolerance, as its own error is of higher order. Largest parabola where
 # derivatives are computed, over its power: a search needs fewer digits of them than a simulation.
@@ -89,16 +91,17 @@ def _restore(c):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _balance(c, h, first):  # type: ignore[no-untyped-def]
+def _balance(c, h, first, near):  # type: ignore[no-untyped-def]
     """Fill strains and stresses at the end of a step, and the terms; return the common stress.
 
     Newton's method begins at the stress that the `first` one and the rates at the start predict.
+    The result is not a number if it does not converge at once, as in a narrow snap.
     """
     new, s, m, gain = c.new, c.springs, _memory(c, c.none), 1.0
     end = c.drive.value + c.drive.value_rate * (c.now.now + h)
     for k in range(c.terms):
         gain += s[RELAX + 2 * k]
-    pushed, change = c.top == STRESS, 0.0
+    pushed, change, off = c.top == STRESS, 0.0, 0.0
     common = end if pushed else first + (gain * m[STEEP] * m[RATE] + m[DRIFT]) * h
     for _ in range(TRIALS):
         miss, compliance, size = -end, 0.0, abs(end)
@@ -110,9 +113,9 @@ def _balance(c, h, first):  # type: ignore[no-untyped-def]
             size += s.height * abs(s.eps)
         if pushed:
             break
-        change = -miss / compliance
+        change, off = -miss / compliance, abs(miss) - near * size
         common += change
-        if abs(miss) <= NEAR * size:
+        if off <= 0.0:
             break
     for i in range(c.count):
         s, n, m = spring(c, i), numbers(c, i), _memory(c, i)
@@ -123,7 +126,7 @@ def _balance(c, h, first):  # type: ignore[no-untyped-def]
         for k in range(c.terms):
             x = h / s[RELAX + 2 * k + 1]
             new[n.z_at + k] -= x * m[TABLES + k * TABLE + 2] * m[LAST]
-    return common
+    return common if off <= 0.0 else math.nan
 
 
 @inner
@@ -148,7 +151,7 @@ def _correct(c, h, want, tol, common):  # type: ignore[no-untyped-def]
             if size > 0.0:
                 error = max(error, max(abs(more) / (CUBIC * tol), abs(bend) / least) / size)
         s.midway = RISE * (s.eps - s.old_eps) / h + EARLY * s.old_rate + LATE * s.rate
-    return error if balanced else math.inf
+    return error if balanced and abs(common) < math.inf else math.inf
 
 
 @inner
@@ -185,7 +188,7 @@ def _derive(c, h):  # type: ignore[no-untyped-def]
 def _try(c, h, want, tol, first):  # type: ignore[no-untyped-def]
     """Fill the state at the end of a step; return the largest error over the one allowed."""
     _prepare(c, h)
-    common = _balance(c, h, first)
+    common = _balance(c, h, first, min(NEAR, CLOSE * tol))
     _restore(c)
     rates(c, c.new, past(c.stage, STEPPED * c.wide), c.none, c.now.now + h)
     return _correct(c, h, want, tol, common)
