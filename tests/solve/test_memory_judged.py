@@ -101,12 +101,13 @@ def test_fresh_scenes_with_memory(family: str, monkeypatch: pytest.MonkeyPatch) 
 # together, or whose stresses drifted apart; a relaxation step that interpolated the stress between
 # its ends where a snap began; a relaxation step at constant rank whose third Legendre coefficient
 # is almost zero; a spring that turns twice within a step; a spring that turns because another one
-# of its group begins to snap back.
+# of its group begins to snap back; a common stress at the end of a step that was not yet found.
 HARD = [
     ("microscale:3", 1e-6), ("microscale:165", 1e-6), ("microscale:226", 1e-8),
     ("microscale:365", 1e-8), ("mixed:233", 1e-6), ("mixed:388", 1e-6),
     ("microscale+relaxation:141", 1e-6), ("microscale+relaxation:7016", 1e-8),
     ("microscale+relaxation:218", 1e-9), ("microscale:55", 1e-6), ("worn+relaxation:117", 1e-8),
+    ("worn motion:3", 1e-8),
 ]  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from foamfit.springs.laws.record import OWN_RELAXATION
 # Memory of a spring, see `layout`: stress, slope, strain rate and drift at the start of a step, the
 # stress at its end. Then the table of each relaxation term.
 FIRST, STEEP, RATE, DRIFT, LAST, TABLES = range(6)
-# Newton's method: relative elongation that a last step corrects, at most and over the tolerance, and
+# Newton's method: relative elongation that a last step corrects, at most and over the tolerance;
 # number of steps.
 NEAR, CLOSE, TRIALS = 1e-7, 100.0, 4
 ROUNDED = 1e-9  # difference between the stresses of two springs over their scale
