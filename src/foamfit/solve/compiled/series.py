@@ -33,6 +33,9 @@ ROUNDED = 1e-9  # difference between the stresses of two springs over their scal
 # derivatives are computed, over its power: a search needs fewer digits of them than a simulation.
 CUBIC, PARABOLA, POWER = 2.0, 2e4, 1.5
 SHORTEST = 0.15  # share of the rest of a piece; shorter steps would cost more than one of order 8
+# Change of a strain rate, over its sizes at both ends of a step, above which the law bends sharply
+# between them; what then counts as the error.
+ABRUPT, BENT = 0.5, 8.0
 PAUSE = 2  # steps without an attempt after one that was not accurate
 # The strain rate at MIDDLE follows from the rise of the strain and the rates at both ends.
 RISE, EARLY, LATE = (
@@ -138,6 +141,8 @@ def _correct(c, h, want, tol, common):  # type: ignore[no-untyped-def]
         s, n, m = spring(c, i), numbers(c, i), _memory(c, i)
         most = max(abs(common), c.now.largest)
         balanced = balanced and abs(s.total - common) <= ROUNDED * most
+        if abs(s.rate - m[RATE]) > ABRUPT * (abs(s.rate) + abs(m[RATE])):
+            error = max(error, BENT)
         low = m[STEEP] * m[RATE] * h
         square = m[LAST] - m[FIRST] - low
         cube = s.slope * s.rate * h - low - 2.0 * square
