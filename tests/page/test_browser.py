@@ -7,6 +7,7 @@ import shutil
 import tomllib
 import zipfile
 from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,9 @@ def rows(change=lambda i, row: row):
 # Text of each invalid file, and words of the error message.
 BAD = {
     "word.csv": (rows(lambda i, r: "9,oops,1" if i == 9 else r), "row 11"),
+    "no-unit.csv": (rows().replace("force (N)", "force"), "'force'"),
+    "constant.csv": (rows(lambda i, r: f"{i},5,{0.01 * i}"), "is constant"),
+    "back.csv": (rows(lambda i, r: "3,2.0,0.2" if i == 20 else r), "time goes back"),
     "picture.png": ("\x89PNG", "picture.png is not a table"),
 }
 
@@ -282,7 +286,7 @@ def test_everyone_can_use_it_at_once(window):
     """Check for accessibility, no cut-off content and keyboard access."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is missing")
     load(window)
-    for width, colours in ((390, "dark"), (1280, "light")):  # widths of a phone and a laptop
+    for width, colours in product((390, 1280), ("dark", "light")):  # widths of a phone and a laptop
         window.emulate_media(color_scheme=colours)
         window.set_viewport_size({"width": width, "height": 900})
         window.wait_for_function(f"document.documentElement.scrollWidth <= {width}")

@@ -95,11 +95,12 @@ def stamps(out):
 
 def test_the_same_numbers_with_any_number_of_processes_and_anywhere(here):
     (here / "tests/c.csv").unlink()
+    again(out="one", executor=None, jobs=1, **QUICK)
     frame = again(out="two", executor=None, jobs=2, **QUICK)
     again(out="inline", **QUICK)
-    made = numbers("inline")
+    made = numbers("one")
     assert list(made) == ["a", "b"]
-    assert made == numbers("two")
+    assert made == numbers("two") == numbers("inline")
     alone = ff.fit(ff.read_test("tests/b.csv", "foam.toml"), **QUICK)
     row = frame.set_index("test").loc
     assert row["b", "s1_k0"] == alone.params["s1_k0"].value

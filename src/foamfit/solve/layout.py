@@ -199,7 +199,7 @@ def _memory_of_relaxation(shape: Shape, allowed: bool) -> int:
     count, known = len(shape.laws), shape.top in (MOTION, STRESS)
     needed = shape.terms > 0 and shape.degree == 0 and len(shape.ends) == 1
     needed = needed and allowed and known and not any(shape.damped)
-    return count * (5 + 8 * shape.terms) if needed else 0
+    return count * (4 + 8 * shape.terms) if needed else 0
 
 
 @lru_cache(maxsize=1024)

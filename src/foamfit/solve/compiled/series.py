@@ -22,13 +22,13 @@ from foamfit.solve.scene import STRESS
 from foamfit.springs.compiled.contract import RELAX, inner, past, pointed
 from foamfit.springs.laws.record import OWN_RELAXATION
 
-# Memory of a spring, see `layout`: stress, slope, strain rate and drift at the start of a step, the
+# Memory of a spring, see `layout`: stress, slope and strain rate at the start of a step, and the
 # stress at its end. Then the table of each relaxation term.
-FIRST, STEEP, RATE, DRIFT, LAST, TABLES = range(6)
+FIRST, STEEP, RATE, LAST, TABLES = range(5)
 # Newton's method: relative elongation that a last step corrects, at most and over the tolerance;
 # number of steps.
 NEAR, CLOSE, TRIALS = 1e-7, 100.0, 4
-ROUNDED = 1e-9  # difference between the stresses of two springs over their scale
+EQUAL = 1e-9  # difference between the stresses of two springs over their scale
 # Largest cubic term over the tolerance, as its own error is of higher order. Largest parabola where
 # derivatives are computed, over its power: a search needs fewer digits of them than a simulation.
 CUBIC, PARABOLA, POWER = 2.0, 2e4, 1.5
@@ -57,7 +57,7 @@ def _keep(c):  # type: ignore[no-untyped-def]
     for i in range(c.count):
         s, m = spring(c, i), _memory(c, i)
         steep = steep and s.slope > 0.0 and s.sigma_low < s.sigma_high
-        m[FIRST], m[STEEP], m[RATE], m[DRIFT] = s.sigma, s.slope, s.rate, s.drift
+        m[FIRST], m[STEEP], m[RATE] = s.sigma, s.slope, s.rate
     return steep
 
 
@@ -94,18 +94,14 @@ def _restore(c):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _balance(c, h, first, near):  # type: ignore[no-untyped-def]
+def _balance(c, h, guess, near):  # type: ignore[no-untyped-def]
     """Fill strains and stresses at the end of a step, and the terms; return the common stress.
 
-    Newton's method begins at the stress that the `first` one and the rates at the start predict.
-    The result is not a number if it does not converge at once, as in a narrow snap.
+    The result is not a number if Newton's method does not converge at once, as in a narrow snap.
     """
-    new, s, m, gain = c.new, c.springs, _memory(c, c.none), 1.0
+    new, pushed, change, off = c.new, c.top == STRESS, 0.0, 0.0
     end = c.drive.value + c.drive.value_rate * (c.now.now + h)
-    for k in range(c.terms):
-        gain += s[RELAX + 2 * k]
-    pushed, change, off = c.top == STRESS, 0.0, 0.0
-    common = end if pushed else first + (gain * m[STEEP] * m[RATE] + m[DRIFT]) * h
+    common = end if pushed else guess
     for _ in range(TRIALS):
         miss, compliance, size = -end, 0.0, abs(end)
         for i in range(c.count):
@@ -140,7 +136,7 @@ def _correct(c, h, want, tol, common):  # type: ignore[no-untyped-def]
     for i in range(c.count):
         s, n, m = spring(c, i), numbers(c, i), _memory(c, i)
         most = max(abs(common), c.now.largest)
-        balanced = balanced and abs(s.total - common) <= ROUNDED * most
+        balanced = balanced and abs(s.total - common) <= EQUAL * most
         if abs(s.rate - m[RATE]) > ABRUPT * (abs(s.rate) + abs(m[RATE])):
             error = max(error, BENT)
         low = m[STEEP] * m[RATE] * h
@@ -190,10 +186,10 @@ def _derive(c, h):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _try(c, h, want, tol, first):  # type: ignore[no-untyped-def]
+def _try(c, h, want, tol, guess):  # type: ignore[no-untyped-def]
     """Fill the state at the end of a step; return the largest error over the one allowed."""
     _prepare(c, h)
-    common = _balance(c, h, first, min(NEAR, CLOSE * tol))
+    common = _balance(c, h, guess, min(NEAR, CLOSE * tol))
     _restore(c)
     rates(c, c.new, past(c.stage, STEPPED * c.wide), c.none, c.now.now + h)
     return _correct(c, h, want, tol, common)
@@ -203,14 +199,14 @@ def _try(c, h, want, tol, first):  # type: ignore[no-untyped-def]
 def relaxing_step(words, want, tol):  # type: ignore[no-untyped-def]
     """Try one step up to the next sample, or a shorter one; return whether it was taken."""
     c = unpack(words)
-    r, first = c.now, c.carried[0]
-    rest = r.horizon - r.now
+    r, s, first, rest = c.now, c.springs, c.carried[0], c.now.horizon - c.now.now
+    climb = s.gain * s.slope * s.rate + s.drift  # rate of the common stress
     r.paused -= 1.0
     if r.paused >= 0.0 or not rest > 0.0 or not _keep(c):
         return c.none
     h = min(max(r.step, SHORTEST * rest), rest)
     while h >= SHORTEST * rest:
-        error = _try(c, h, want, tol, first)
+        error = _try(c, h, want, tol, first + climb * h)
         if error <= 1.0:
             break
         h *= max(0.2, 0.8 * error ** (-1.0 / 3.0)) if error < math.inf else 0.0
