@@ -13,7 +13,7 @@ from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
 from foamfit.fitting.together import Together
-from foamfit.report.figures import image
+from foamfit.report.figures import images
 from foamfit.study.joint_fit import Alternative, fit_jointly
 from foamfit.study.joint_parameters import result_of
 from foamfit.study.joint_result import JointResult, joint_page, plot_joint
@@ -106,7 +106,7 @@ def test_the_picture_has_the_loops_and_the_law_of_rate(found):
     assert panel.get_xlabel().startswith("log rate, b = 0.0")
     law = next(line for line in panel.lines if line.get_label() == "common").get_xdata()
     assert law[-1] / law[0] == pytest.approx((1 + 0.05 * 2.303) / (1 - 0.05 * 2.303), rel=0.02)
-    assert image(figure, "png", 50).startswith(b"\x89PNG")
+    assert images(figure, "png", dpi=50)[0].startswith(b"\x89PNG")
 
 
 def test_parameters_stand_side_by_side(found):

@@ -12,7 +12,7 @@ import fabricated
 import foamfit as ff
 from foamfit.api import FitResult
 from foamfit.errors import InputError
-from foamfit.report.figures import image
+from foamfit.report.figures import images
 from foamfit.report.plots import origin_word, plot_fit, plot_response
 from foamfit.report.result_figures import plot_snapping
 from foamfit.results import Switch
@@ -87,7 +87,7 @@ def test_names_of_springs_that_switch_together_do_not_overprint(later: float) ->
         place = (curves.time[at], curves.displacement[at], curves.stress[at])
         switches.append(Switch(1, switch.source, switch.target, *map(float, place)))
     figure = plot_fit(replace(result, switches=tuple(switches)))
-    image(figure, "png", 100)
+    images(figure, "png", dpi=100)
     for ax in figure.axes[:3]:
         assert len(ax.texts) == 8
         boxes = [text.get_window_extent() for text in ax.texts]
@@ -107,7 +107,7 @@ def test_a_panel_without_curves_is_left_out(missing: list[str], labels: list[str
     result = with_curves(fabricated.result(), **dict.fromkeys(missing))
     figure = plot_fit(result)
     assert [ax.get_xlabel() for ax in figure.axes if ax.axison and ax.get_xlabel()] == labels
-    assert image(figure, "png")
+    assert images(figure, "png")[0]
 
 
 def test_the_origin_is_visible_even_if_only_a_note_tells_it() -> None:
@@ -125,7 +125,7 @@ def test_the_origin_is_visible_even_if_only_a_note_tells_it() -> None:
 
 def test_a_name_is_no_formula_and_may_be_in_any_script() -> None:
     measurement = replace(fabricated.result().measurement, name=r"$\frac{1$ 測試")
-    assert image(plot_fit(fabricated.result(measurement=measurement)), "png")
+    assert images(plot_fit(fabricated.result(measurement=measurement)), "png")[0]
 
 
 def test_a_figure_that_cannot_be_written_is_an_input_error(tmp_path: Path) -> None:

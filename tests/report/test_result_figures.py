@@ -10,7 +10,7 @@ from typing import Any
 
 import fabricated
 from conftest import EXPERIMENTS
-from foamfit.report.figures import image
+from foamfit.report.figures import images
 from foamfit.report.result_figures import figures_of
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
@@ -20,7 +20,7 @@ def test_the_figure_of_a_fit_is_a_picture_and_has_text(tmp_path: Path) -> None:
     folder = fabricated.result().save(tmp_path / "r")
     assert (folder / "fit.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "fit.pdf").read_bytes().startswith(b"%PDF")
-    svg = image(figures_of(fabricated.result())["fit"], "svg")
+    (svg,) = images(figures_of(fabricated.result())["fit"], "svg")
     assert b"stress (MPa)</text>" in svg
 
 

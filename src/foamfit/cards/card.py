@@ -32,7 +32,7 @@ from foamfit.errors import InputError
 from foamfit.files import check_file, write_file
 from foamfit.parts import law_in_words
 from foamfit.report import figures
-from foamfit.report.figures import BLUE, FITTED, SEEN, image
+from foamfit.report.figures import BLUE, FITTED, SEEN, images
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import environment, words
 from foamfit.results import Fit
@@ -207,7 +207,7 @@ class Card:
             check_file(one)
         figure = draw(self)
         text = json.dumps(self.to_json_dict(), indent=2, allow_nan=False) + "\n"
-        contents = (self.text.encode(), text.encode(), image(figure, "png"), image(figure, "pdf"))
+        contents = (self.text.encode(), text.encode(), *images(figure, "png", "pdf"))
         for one, content in zip(files, contents, strict=True):
             write_file(one, content)
         return path

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import lmfit
 import numpy as np
@@ -223,7 +223,7 @@ class Problem:
         """Names in the order of the flat vector: parameters of the model, then nuisance ones."""
         return (*self.model.names, *self.objective.nuisance)
 
-    @property
+    @cached_property
     def index(self) -> dict[str, int]:
         """Index of each parameter in the flat vector."""
         return {name: i for i, name in enumerate(self.names)}
@@ -285,41 +285,38 @@ class Problem:
             params[name].set(value=one.mean, vary=False)
         return replace(self, params=params, kept=free)
 
+    @cached_property
     def tied(self) -> Tied | None:
-        """Return a function that sets the parameters given by expressions; None without any."""
-        tied = [name for name in self.names if self.params[name].expr is not None]
-        total, first = self.measurement.specimen.height, self.index.get("s1_height", 0)
-        last = first + len(self.model.kinds) - 1
+        """A function that sets the parameters given by expressions; None without any."""
+        expressions = {name: one.expr for name, one in self.params.items() if one.expr is not None}
+        if [*expressions.values()] == [_rest_of_height(self.measurement, self.model)]:
+            return self._with_rest  # faster than lmfit
+        return partial(self._evaluated, self.params.copy(), [*expressions]) if expressions else None
 
-        def rest(values: Array) -> Array:
-            values[last] = total - values[first:last].sum(axis=0)
-            return values
+    def _with_rest(self, values: Array) -> Array:
+        """Set the height of the last spring."""
+        first, last = self.index["s1_height"], self.index[f"s{len(self.model.kinds)}_height"]
+        values[last] = self.measurement.specimen.height - values[first:last].sum(axis=0)
+        return values
 
-        expressions = [self.params[name].expr for name in tied]
-        if expressions == [_rest_of_height(self.measurement, self.model)]:  # faster than lmfit
-            return rest
-        places, scratch = [self.index[name] for name in tied], self.params.copy()
-
-        def evaluated(values: Array) -> Array:
-            if values.ndim > 1:
-                return np.column_stack([evaluated(one) for one in values.T])
-            for name in self.free():
-                scratch[name].value = values[self.index[name]]
-            scratch.update_constraints()
-            for name, place in zip(tied, places, strict=True):
-                values[place] = scratch[name].value
-            return values
-
-        return evaluated if tied else None
+    def _evaluated(self, params: lmfit.Parameters, tied: list[str], values: Array) -> Array:
+        """Set the `tied` parameters by lmfit, whose `params` are overwritten."""
+        if values.ndim > 1:
+            return np.column_stack([self._evaluated(params, tied, one) for one in values.T])
+        for name, place in self.index.items():
+            if name not in tied:
+                params[name].value = values[place]
+        params.update_constraints()
+        for name in tied:
+            values[self.index[name]] = params[name].value
+        return values
 
     def space(self) -> Space:
         """Return the box of the search."""
         params = [self.params[name] for name in self.names]
         low, high = np.array([one.min for one in params]), np.array([one.max for one in params])
         vector = self.vector()
-        return Space(
-            self.model, self.names, self.scales, vector, self.free(), low, high, self.tied()
-        )
+        return Space(self.model, self.names, self.scales, vector, self.free(), low, high, self.tied)
 
     def sizes(self, names: tuple[str, ...], values: Array) -> Array:
         """Return the scales of some parameters at a point."""
@@ -337,9 +334,9 @@ class Problem:
     def moves(self, values: Array, names: tuple[str, ...]) -> Array:
         """Return how all parameters move with each of these, (n_values, n_names)."""
         moves = np.eye(values.size)[:, [self.index[name] for name in names]]
-        if (tied := self.tied()) is None:
+        if self.tied is None:
             return moves
-        return follow(tied, values, moves, 1e-5 * self.sizes(names, values))
+        return follow(self.tied, values, moves, 1e-5 * self.sizes(names, values))
 
 
 def _check_held(params: lmfit.Parameters) -> None:

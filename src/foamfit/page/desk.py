@@ -369,7 +369,7 @@ def _picture(csv: Path, toml: Path, strained: bool) -> bytes:
         axes = figures.grid_of(figure, 1, max(len(panels), 1), len(panels))
         for ax, panel in zip(axes, panels, strict=True):
             draw(ax, panel)
-    return figures.image(figure, "png", 130)
+    return figures.images(figure, "png", dpi=130)[0]
 
 
 def remedies(message: str) -> dict[str, tuple[str, dict[str, Any]]]:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
+Format = Literal["png", "pdf", "svg"]
+
 GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # palette of Okabe and Ito
 INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # interior masses, from the base up
 # Measured and simulated curves of all small figures; also in greyscale one is darker.
@@ -145,16 +147,30 @@ def legend_below(figure: Figure, entries: dict[str, Any]) -> None:
     figure.set_figheight(figure.get_figheight() + LINE * (lines - 1))
 
 
-def image(figure: Figure, form: Literal["png", "pdf", "svg"], dpi: int = DPI) -> bytes:
-    """Return the figure as the bytes of a file; `dpi` is that of pixels."""
+def images(figure: Figure, *forms: Format, dpi: int = DPI) -> list[bytes]:
+    """Return the figure as the bytes of a file of each format; `dpi` is that of pixels.
+
+    The layout is found once for all of them, as it takes longer than drawing one.
+    """
     import matplotlib
 
+    with matplotlib.rc_context(STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # in names of tests
+        engine = figure.get_layout_engine()
+        if engine is not None:
+            engine.execute(figure)
+            figure.set_layout_engine(None)
+        files = [_file(figure, form, dpi) for form in forms]
+        figure.set_layout_engine(engine)
+    return files
+
+
+def _file(figure: Figure, form: Format, dpi: int) -> bytes:
+    """Return the figure, laid out, as the bytes of a file."""
     buffer = io.BytesIO()
     # Without a date the same fit gives the same file.
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(form)
-    with matplotlib.rc_context(STYLE), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing")  # in names of tests
-        figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
+    figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
     if form != "svg":
         return buffer.getvalue()
     # Verdana has nearly the same widths, where a browser lacks the font.
@@ -176,7 +192,7 @@ def say_nothing_there(ax: Axes, text: str = "no curve to compare") -> None:
     ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes)
 
 
-def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
+def figure_format(path: str | Path) -> Format:
     """Return the format given by the suffix of a path; InputError if it is not supported."""
     match Path(path).suffix.lower()[1:]:
         case ("png" | "pdf" | "svg") as form:
@@ -186,13 +202,14 @@ def figure_format(path: str | Path) -> Literal["png", "pdf", "svg"]:
 
 def write_both(figure: Figure, place: Path) -> bytes:
     """Write a figure as PNG and PDF; return it as SVG. `place` is a path without suffix."""
-    write_file(place.with_suffix(".png"), image(figure, "png"))
-    write_file(place.with_suffix(".pdf"), image(figure, "pdf"))
-    return image(figure, "svg")
+    png, pdf, svg = images(figure, "png", "pdf", "svg")
+    write_file(place.with_suffix(".png"), png)
+    write_file(place.with_suffix(".pdf"), pdf)
+    return svg
 
 
 def save(figure: Figure, path: str | Path | None) -> Figure:
     """Save a figure in the format of the suffix of `path`, if there is one; return the figure."""
     if path is not None:
-        write_file(path, image(figure, figure_format(path)))
+        write_file(path, *images(figure, figure_format(path)))
     return figure

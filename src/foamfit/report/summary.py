@@ -10,7 +10,7 @@ from foamfit.data.measurement import interior_channel
 from foamfit.fitting.branches import covered
 from foamfit.fitting.nuisance import POSITIVE
 from foamfit.parts import ParameterEstimate
-from foamfit.report.figures import image
+from foamfit.report.figures import images
 from foamfit.report.plots import origin_word
 from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page, sentences, table, words
@@ -216,9 +216,16 @@ def tables(result: Fit) -> dict[str, list[list[str]]]:
     }
 
 
-def render_report(result: Fit, figures: Mapping[str, Figure] | None = None) -> str:
-    """Return the report as a self-contained HTML page; `figures` are those of `figures_of`."""
+def render_report(
+    result: Fit, figures: Mapping[str, Figure] | None = None, fit_svg: bytes | None = None
+) -> str:
+    """Return the report as a self-contained HTML page.
+
+    `figures` are those of `figures_of`, `fit_svg` is the one of the fit as SVG, if there is one.
+    """
     drawn = figures_of(result) if figures is None else figures
+    svg = {} if fit_svg is None else {"fit": fit_svg}
+    svg |= {name: images(one, "svg")[0] for name, one in drawn.items() if name not in svg}
     plain, springs, insight = result.to_json_dict(), result.springs, result.insight
     parts, shares = ((), None) if insight is None else (insight.parts, insight.shares())
     return page(
@@ -239,5 +246,5 @@ def render_report(result: Fit, figures: Mapping[str, Figure] | None = None) -> s
         parts=[] if shares is None else list(zip(parts, shares.T.tolist(), strict=True)),
         correlation=[] if result.correlation is None else result.correlation.matrix.tolist(),
         **tables(result),
-        figures={n: (one.get_figwidth(), image(one, "svg")) for n, one in drawn.items()},
+        figures={name: (one.get_figwidth(), svg[name]) for name, one in drawn.items()},
     )
