@@ -37,10 +37,13 @@ FIRST, HISTORY, PREDICTED = "first cycle", "cycles 1 to 3", "predicted"
 CHOSEN = [f"new-heel-comp-{i}" for i in (1, 2, 4, 5)]
 BARS = {FIRST: (0.56, 0.75), HISTORY: (0.90, 1.10), PREDICTED: (1.0, 1.25)}  # mean, worst, %
 # Columns of motion and force in the files that are searched for partial unloading.
-MOTIONS = "Gap (um)", "Position(Linear:Position) (mm)", "displacement_m", "Strain"
+MOTIONS = (
+    "Gap (um)", "Position(Linear:Position) (mm)", "displacement_m", "Strain",
+    "engineering_strain",
+)  # fmt: skip
 FORCES = (
     "Normal force (N)", "Force(Linear:Load) (kN)", "force_N", "specific_force_N_per_kg",
-    "Stress (MPa)",
+    "Stress (MPa)", "engineering_stress_MPa",
 )  # fmt: skip
 LOADED, WHOLE = 0.05, 0.35  # minimum shares of the largest force and of the motion
 MEMORY: dict[str, Any] = {"model": "microscale", "stiffening": True, "mullins": True}

@@ -3,6 +3,7 @@
 import json
 import math
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,12 @@ import pytest
 
 import foamfit as ff
 from conftest import run, run_refused, write_csv
-from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
-from foamfit.data.rig import candidates, read_rig
+from foamfit.data.measurement import INTEGRATED, MEASURED, Measurement, Noise, Specimen, Striker
+from foamfit.data.rig import Candidate, candidates, read_rig
 from foamfit.errors import InputError
+from foamfit.fitting.problem import make_problem
 from foamfit.study import plan as plan_module
+from foamfit.study.gain import Target, problem_for
 from foamfit.study.study_file import read_study
 
 QUANTITY = "peak_force at 2.5 m/s"
@@ -156,6 +159,39 @@ def test_a_rival_law_is_told_apart_by_a_test_beyond_the_first(soft):
     again = next(one for one in found.outcomes if one.candidate.repeat)
     assert found.rivals == ("microscale",)
     assert found.advice.apart["microscale"] > again.apart["microscale"]
+
+
+@pytest.mark.parametrize("name", ["peak_force", "peak_strain", "absorbed_energy"])
+@pytest.mark.parametrize("motion", [MEASURED, INTEGRATED])
+def test_slopes_of_a_quantity_are_its_differences(name, motion):
+    """A motion that was integrated from the force has slopes as well; their loss promised ±0."""
+    (known_test,), _ = plan_module._read(["foam-1/model-1"])
+    record = replace(known_test.problem.measurement, motion=motion)
+    problem = make_problem(record, "bistable", "impact", None, None, False)
+    test = plan_module.Test(problem, np.resize(known_test.values, len(problem.names)))
+    known = plan_module.known_of([test], np.random.default_rng(0), 0)
+    rig = read_rig(None, record)
+    target = Target.of(f"{name} at 3 m/s", known, rig)
+    asked = problem_for(known, Candidate("impact", 7e-3, 3.0), rig, with_motion=True)
+    for i, parameter in enumerate(known.names):
+        step = np.zeros(len(problem.names))
+        step[problem.index[parameter]] = 1e-5 * known.sizes[i]
+        # To one side, as the spring is not damped.
+        at = [Target._in_draw(name, known, asked, known.values + i * step)[0] for i in range(3)]
+        slope = (4.0 * at[1] - at[2] - 3.0 * at[0]) / 2e-5
+        assert target.slopes[0, i] == pytest.approx(slope, abs=1e-4 * np.abs(target.slopes).max())
+    assert target.error(known, []) > 0.0
+
+
+def test_the_same_law_with_relaxation_is_a_rival(monkeypatch):
+    plain = plan_module._published("foam-1/model-1")
+    record = plain.problem.measurement
+    relaxing = make_problem(record, "bistable", "impact", None, None, False, relaxation=1)
+    tests = {"foam-1/model-1": plain, "foam-1/model-2": plan_module.Test(relaxing, np.empty(0))}
+    monkeypatch.setattr(plan_module, "_published", tests.get)
+    same, rivals = plan_module._read([*tests])
+    assert [one.problem for one in same] == [plain.problem]
+    assert [*rivals] == ["bistable with relaxation"]
 
 
 def test_files_and_terminal(soft, of_quantity, tmp_path, monkeypatch):

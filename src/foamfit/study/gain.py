@@ -17,6 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from foamfit.arrays import Array, Mask
+from foamfit.data.measurement import MEASURED
 from foamfit.data.rig import Candidate, Rig
 from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError, SimulationError
@@ -111,14 +112,22 @@ def information(rows: Array, root: Array) -> tuple[Array, Array]:
     return bread, bread @ alone @ bread
 
 
-def problem_for(known: Known, candidate: Candidate, rig: Rig) -> Problem:
-    """Return the problem of a candidate with the law of the tests at hand."""
+def problem_for(
+    known: Known, candidate: Candidate, rig: Rig, *, with_motion: bool = False
+) -> Problem:
+    """Return the problem of a candidate with the law of the tests at hand.
+
+    With `with_motion` the motion counts even if the rig does not record it.
+    """
     problem, test = known.problem, known.problem.measurement
     lasts, peak = 0.0, problem.scales.stress
     impact = candidate.drive == "impact"
     if impact:
         lasts, peak = _duration_and_peak(known, candidate, peak)
     record = candidate.recorded(test, rig, lasts, peak)
+    if with_motion and record.stress is not None:
+        moved = 0.5 * test.specimen.height * np.linspace(0.0, 1.0, record.stress.size)
+        record = replace(record, displacement=moved, motion=MEASURED)
     inside = problem.objective.interior_mass and impact
     law, terms = problem.model.name, problem.model.relaxation
     return make_problem(record, law, candidate.drive, None, None, inside, relaxation=terms)
@@ -292,7 +301,7 @@ class Target:
         mass = (striker and striker.mass) or (rig.masses[0] if rig.masses else None)
         if mass is None or velocity <= 0.0:
             raise InputError(f"quantity {text!r} needs a striker; give its mass in the rig")
-        problem = problem_for(known, Candidate("impact", mass, velocity), rig)
+        problem = problem_for(known, Candidate("impact", mass, velocity), rig, with_motion=True)
         found = [cls._in_draw(name, known, problem, drawn) for drawn in known.draws]
         values, slopes = zip(*found, strict=True)
         return cls(text, UNITS[name], np.array(values), np.array(slopes))
@@ -309,8 +318,7 @@ class Target:
         parts = objective.by_curve(problem.slopes(values, known.names) * known.sizes)
         by = {curve: part.T / objective.factor(curve) for curve, part in parts.items()}
         stress, moved = curves["stress_time"], curves["displacement_time"]
-        by_stress = by["stress_time"]
-        by_motion = by.get("displacement_time", 0.0 * by_stress)
+        by_stress, by_motion = by["stress_time"], by["displacement_time"]
         if name == "peak_force":
             at = int(np.argmax(stress))
             return float(stress[at]) * specimen.area, by_stress[:, at] * specimen.area

@@ -27,6 +27,7 @@ from foamfit.fitting.branches import unreached
 from foamfit.fitting.minimizer import problem_of
 from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import Problem, make_problem
+from foamfit.parts import rung_name
 from foamfit.report.studies.plan import RISKY, Expected, Outcome, Plan
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Chain, Impact
@@ -187,8 +188,10 @@ def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
         raise InputError("name at least one result to plan from")
     first = found[0].problem.model
     same = [one for one in found if one.problem.model == first]
-    rest = [one for one in found if one.problem.model.kinds != first.kinds]
-    return same, {one.problem.model.words: one for one in rest}
+    rest = [one for one in found if one.problem.model != first]
+    return same, {
+        rung_name(x.problem.model.name, "none", x.problem.model.relaxation): x for x in rest
+    }
 
 
 def _published(name: str) -> Test:
