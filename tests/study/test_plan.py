@@ -97,6 +97,17 @@ def test_a_test_that_exceeds_the_force_of_the_sensor_is_shown_and_not_advised(pl
     assert planned.advice not in strong
 
 
+def test_table_and_plot_show_each_test_and_each_parameter(planned):
+    table, best = planned.table(), planned.advice.candidate
+    assert len(table) == len(planned.outcomes)
+    (row,) = table[(table.mass == best.mass) & (table.velocity == best.velocity)].to_dict("records")
+    assert row["determined"] == planned.advice.number
+    assert row["s1_k0_ci95_width"] == planned.advice.expected["s1_k0"].ci95_width
+    axes = planned.plot()
+    assert [one.get_text() for one in axes.get_yticklabels()] == planned.own([*planned.now])
+    assert len(axes.get_legend().get_texts()) == 2
+
+
 def test_without_a_safe_test_none_is_advised(soft, tmp_path):
     rig = tmp_path / "RIG.toml"
     rig.write_text(RIG.format(force=1), encoding="utf-8")

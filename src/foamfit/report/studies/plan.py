@@ -182,6 +182,7 @@ class Plan(Result):
         """Draw the intervals now and after the advised test; returns the axes."""
         with figures.axes_or_new(ax) as axes:
             draw_intervals(axes, self)
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=2)
         return axes
 
     def to_json_dict(self) -> dict[str, Any]:
