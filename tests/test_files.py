@@ -34,7 +34,9 @@ posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions o
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Change to an empty directory and replace the pictures, so that saving is fast."""
     without_pictures(monkeypatch)
-    monkeypatch.setattr(foamfit.report.figures, "image", lambda *_: b"\x89PNG" + bytes(20))
+    monkeypatch.setattr(
+        foamfit.report.figures, "images", lambda _, *forms: [b"\x89PNG" + bytes(20) for _ in forms]
+    )
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

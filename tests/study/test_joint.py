@@ -95,7 +95,7 @@ def test_values_are_found_with_their_intervals(found):
 
 def coarse(figure, place, *_):
     """Render a figure of the page at a fifth of the resolution, to save time."""
-    return joint_report.figures.image(figure, "png", 36)
+    return joint_report.figures.images(figure, "png", dpi=36)[0]
 
 
 def test_linked_values_are_one_value_bit_for_bit(found, tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 import foamfit as ff
-from conftest import run, run_refused, synthetic_impact, write_measurement
+from conftest import few_bytes, run, run_refused, synthetic_impact, write_measurement
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.errors import InputError, SimulationError
@@ -537,7 +537,7 @@ def test_the_command_writes_a_folder_whole(tmp_path, monkeypatch, record, result
 
 
 def test_the_command_replaces_predictions_and_nothing_else(tmp_path, monkeypatch, record, result):
-    monkeypatch.setattr(prediction_report.figures, "image", lambda *_: b"\x89PNG" + bytes(20))
+    monkeypatch.setattr(prediction_report.figures, "write_both", few_bytes)
     before = (result / "fit.json").read_bytes()
     told = run_refused("predict", result, record, "--out", result, "--draws", DRAWS)
     assert "holds fit.json, which does not belong to a prediction" in told
