@@ -110,7 +110,7 @@ def plan(
     """
     tests, rivals = _read(results)
     rng, test = np.random.default_rng(seed), tests[0].problem.measurement
-    relaxing = tests[0].problem.model.relaxation > 0
+    relaxing = any(one.problem.model.relaxation for one in (tests[0], *rivals.values()))
     limits = read_rig(None if rig is None else Path(rig), test, relaxing=relaxing)
     asked = candidates(limits, test, len(tests[0].problem.model.kinds))
     if not asked:
