@@ -231,7 +231,7 @@ def test_an_older_result_that_a_killed_process_put_aside_comes_back(
 
 
 KILLED = """
-import os, signal, sys
+import time
 from pathlib import Path
 from foamfit.cli import main
 from foamfit.files import replacing
@@ -242,7 +242,8 @@ def write():
     with replacing(Path("r").resolve()) as fresh:
         (fresh / "fit.json").write_text("half")
         print("half", flush=True)
-        signal.pause()
+        while True:
+            time.sleep(0.05)
 
 main(["write"])
 """
