@@ -205,6 +205,12 @@ def _rest_of_height(measurement: Measurement, model: Model) -> str:
     return " - ".join([repr(measurement.specimen.height), *others])
 
 
+def _put_rest(height: float, others: slice, last: int, values: Array) -> Array:
+    """Set the height of the last spring: the specimen minus the others."""
+    values[last] = height - values[others].sum(axis=0)
+    return values
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """The problem of a fit, and the conversion between lmfit's parameters and a flat vector."""
@@ -290,14 +296,10 @@ class Problem:
         """A function that sets the parameters given by expressions; None without any."""
         expressions = {name: one.expr for name, one in self.params.items() if one.expr is not None}
         if [*expressions.values()] == [_rest_of_height(self.measurement, self.model)]:
-            return self._with_rest  # faster than lmfit
+            first, last = self.index["s1_height"], self.index[f"s{len(self.model.kinds)}_height"]
+            height = self.measurement.specimen.height
+            return partial(_put_rest, height, slice(first, last), last)  # faster than lmfit
         return partial(self._evaluated, self.params.copy(), [*expressions]) if expressions else None
-
-    def _with_rest(self, values: Array) -> Array:
-        """Set the height of the last spring."""
-        first, last = self.index["s1_height"], self.index[f"s{len(self.model.kinds)}_height"]
-        values[last] = self.measurement.specimen.height - values[first:last].sum(axis=0)
-        return values
 
     def _evaluated(self, params: lmfit.Parameters, tied: list[str], values: Array) -> Array:
         """Set the `tied` parameters by lmfit, whose `params` are overwritten."""
