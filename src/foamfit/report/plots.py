@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 MOST_NAMED = 12  # loops up to which a legend names all
 # Typographic points: height of panels side by side, of stacked panels and of a residual strip.
 HEIGHT, STACKED, STRIP = 133.0, 112.0, 40.0
-BESIDE_IT, BELOW_IT, LEGEND = 31.0, 26.0, 26.0  # room for labels and for the legend
+BESIDE_IT, BELOW_IT, LEGEND = 51.0, 26.0, 26.0  # room for labels and for the legend
 MOST_WIDE = {0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}  # largest width in inches, by number of panels
 LOOP, WIDER = 165.0, 1.45  # prescribed motion: height of the loop, its width over that of others
 Drawn = tuple["Axes", Panel, tuple[float, float]]  # axes, panel, and its size in points
