@@ -84,11 +84,18 @@ def test_fixed_values_bounds_and_expressions_are_kept():
     params["s1_k0"].set(value=spring.k0, vary=False)
     params["s1_kc"].set(expr="15 * s1_k0")
     params["s1_eps_c"].set(max=0.305)
+    share = spring.kh_minus / spring.kh_plus
+    params["s1_kh_minus"].set(expr=f"{share!r} * s1_kh_plus")
     result = ff.fit(measurement, params=params, starts=4, intervals="local")
     assert result.params["s1_k0"].value == spring.k0
     assert result.params["s1_kc"].value == pytest.approx(15 * spring.k0, rel=1e-12)
     assert result.params["s1_eps_c"].value <= 0.305
     assert result.parameters["s1_k0"].state == "fixed"
+    assert result.parameters["s1_kc"].stderr is None  # as that of s1_k0
+    of, tied = (result.parameters[f"s1_kh_{side}"] for side in ("plus", "minus"))
+    assert (tied.state, tied.stderr) == ("fixed", pytest.approx(share * of.stderr))
+    assert tied.ci95 == pytest.approx([share * end for end in of.ci95])
+    assert result.lmfit.params["s1_kh_minus"].stderr == tied.stderr
     assert result.parameters["s1_eps_c"].state == "weak"  # the true value lies outside the bound
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import repeat
 from typing import Any
@@ -212,17 +212,20 @@ def _estimates(
 ) -> dict[str, ParameterEstimate]:
     """Return the estimates of all parameters; their standard errors are also set in lmfit's."""
     problem, out = best.problem, {}
+    varied = {}
+    if insight is not None:
+        varied = {name: _varied(best, name, insight, intervals, settled) for name in best.names}
     for name, value in zip(problem.names, best.values.tolist(), strict=True):
         if problem.is_exact(name):
             continue
         parameter = problem.params[name]
-        if name in best.names:
-            assert insight is not None
-            estimate = _varied(best, name, insight, intervals, settled)
-        else:
+        if (estimate := varied.get(name)) is None:
             vary, spring = bool(parameter.vary), split_name(name)[0] + 1
             state, key = ("not determined", "unreached") if vary else ("fixed", "held")
-            key, stderr, ends = "tied" if parameter.expr else key, None, None
+            stderr: float | None = None
+            ends: Ends | None = None
+            if parameter.expr:
+                key, (stderr, ends) = "tied", _of_tied(best, name, varied)
             if (shown := problem.kept.get(name)) is not None:
                 key, stderr, half = "kept", shown.sigma, 1.96 * shown.sigma
                 ends = value - half, value + half
@@ -232,6 +235,26 @@ def _estimates(
         parameter.stderr = estimate.stderr
         out[name] = estimate.counted_from(-problem.measurement.origins.get(name, 0.0))
     return out
+
+
+def _of_tied(
+    best: BestPoint, name: str, varied: Mapping[str, ParameterEstimate]
+) -> tuple[float | None, Ends | None]:
+    """Return standard error and 95 % interval of a parameter that an expression gives, linearised.
+
+    If it depends on a single varied parameter, its interval follows from that of the other.
+    """
+    slopes = best.problem.moves(best.values, best.names)[best.problem.index[name]]
+    by = np.flatnonzero(slopes)
+    variance = slopes[by] @ best.spread.matrix[np.ix_(by, by)] @ slopes[by]
+    value, half = best.value(name), 1.96 * math.sqrt(variance)
+    if not 0.0 < half <= covariance.NOTHING * best.problem.sizes((name,), best.values)[0]:
+        return None, None
+    ends = value - half, value + half
+    if by.size == 1 and (ci95 := (one := varied[best.names[by[0]]]).ci95) is not None:
+        first, last = (value + float(slopes[by[0]]) * (end - one.value) for end in ci95)
+        ends = min(first, last), max(first, last)
+    return half / 1.96, ends
 
 
 def _varied(
