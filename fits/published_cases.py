@@ -18,6 +18,7 @@ result folder), fits/comparison.md and fits/comparison.png. It takes half a minu
 
 from __future__ import annotations
 
+import contextlib
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from foamfit.report.comparison import Comparison, compare, comparison_text, plot
 from foamfit.report.folder import load_result
 
 HERE = Path(__file__).parent
-TESTS = HERE.parent / "experiments"
+ROOT, TESTS = HERE.parent, "experiments"
 CASES = {
     "foam-1/model-1": ("foam-1/model-1-2.0mps-reconstruction.csv", "bistable"),
     "foam-1/model-2": ("foam-1/model-2-2.0mps-reconstruction.csv", "bistable"),
@@ -68,7 +69,8 @@ def fit(case: str, drive: str) -> Path:
     test, model = CASES[case]
     model = INSTEAD.get((case, drive), model)
     folder = HERE / case / drive
-    measurement = ff.read_test(TESTS / test)
+    with contextlib.chdir(ROOT):  # the results name their test relative to the repository
+        measurement = ff.read_test(Path(TESTS, test))
     params = ff.make_params(measurement, model, drive)
     for name in params:
         if name.endswith("_eta"):
