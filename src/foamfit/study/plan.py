@@ -110,8 +110,7 @@ def plan(
     """
     tests, rivals = _read(results)
     rng, test = np.random.default_rng(seed), tests[0].problem.measurement
-    relaxing = any(one.problem.model.relaxation for one in (tests[0], *rivals.values()))
-    limits = read_rig(None if rig is None else Path(rig), test, relaxing=relaxing)
+    limits = _rig_of(rig, test, [tests[0], *rivals.values()])
     asked = candidates(limits, test, len(tests[0].problem.model.kinds))
     if not asked:
         raise InputError(
@@ -192,6 +191,12 @@ def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
     return same, {
         rung_name(x.problem.model.name, "none", x.problem.model.relaxation): x for x in rest
     }
+
+
+def _rig_of(path: str | Path | None, test: Measurement, laws: Sequence[Test]) -> Rig:
+    """Return the rig; a hold is worth a try if one of the laws relaxes."""
+    relaxing = any(one.problem.model.relaxation for one in laws)
+    return read_rig(None if path is None else Path(path), test, relaxing=relaxing)
 
 
 def _published(name: str) -> Test:

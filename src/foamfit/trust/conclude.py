@@ -244,10 +244,12 @@ def _of_tied(
 
     If it depends on a single varied parameter, its interval follows from that of the other.
     """
+    if not varied:
+        return None, None
     slopes = best.problem.moves(best.values, best.names)[best.problem.index[name]]
     by = np.flatnonzero(slopes)
-    variance = slopes[by] @ best.spread.matrix[np.ix_(by, by)] @ slopes[by]
-    value, half = best.value(name), 1.96 * math.sqrt(variance)
+    variance = float(slopes[by] @ best.spread.matrix[np.ix_(by, by)] @ slopes[by])
+    value, half = best.value(name), 1.96 * math.sqrt(max(variance, 0.0))
     if not 0.0 < half <= covariance.NOTHING * best.problem.sizes((name,), best.values)[0]:
         return None, None
     ends = value - half, value + half
