@@ -13,7 +13,14 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.cycles import loading_rate
-from foamfit.data.measurement import Measurement, Noise, NoiseLevel, Striker, interior_channel
+from foamfit.data.measurement import (
+    MEASURED,
+    Measurement,
+    Noise,
+    NoiseLevel,
+    Striker,
+    interior_channel,
+)
 from foamfit.data.noise import with_noise
 from foamfit.data.toml_file import (
     COUNT,
@@ -137,10 +144,13 @@ class Candidate:
         time = np.append(np.concatenate(parts), corners[-1])
         return time, height * np.interp(time, corners, levels)
 
-    def recorded(self, test: Measurement, rig: Rig, lasts: float, peak: float) -> Measurement:
+    def recorded(
+        self, test: Measurement, rig: Rig, lasts: float, peak: float, *, with_motion: bool = False
+    ) -> Measurement:
         """Return a record of this test of the specimen of `test`; its values are placeholders.
 
-        An impact `lasts` some time (s), and `peak` is the largest stress (Pa). Noise that the TOML
+        An impact `lasts` some time (s), and `peak` is the largest stress (Pa). The motion is that
+        of `test`, or measured `with_motion`. Noise that the TOML
         of `test` does not state counts as estimated, as in a fit.
         """
         height, known, spreads = test.specimen.height, test.noise, dict(test.uncertainties)
@@ -148,7 +158,8 @@ class Candidate:
         if self.drive == "impact":
             time = np.linspace(0.0, lasts, IMPACT_SAMPLES)
             moved: Array | None = np.linspace(0.0, 0.5 * height, time.size)
-            moved = None if test.displacement is None and test.striker is not None else moved
+            alone = test.displacement is None and test.striker is not None
+            moved = None if alone and not with_motion else moved
             striker = replace(test.striker or Striker(), mass=self.mass, velocity=self.velocity)
             was = test.striker and test.striker.velocity
             if was and self.velocity and "velocity" in spreads:
@@ -165,7 +176,8 @@ class Candidate:
         levels = estimated | {interior_channel(node): estimated["displacement"] for node in seen}
         return Measurement(
             name=str(self), path=None, data_sha256="", time=time, displacement=moved,
-            stress=peak * ramp, specimen=test.specimen, striker=striker, motion=test.motion,
+            stress=peak * ramp, specimen=test.specimen, striker=striker,
+            motion=MEASURED if with_motion else test.motion,
             noise=Noise(estimated=levels), contact="stress", zeros=test.zeros if striker else {},
             interior=dict.fromkeys(sorted(seen), 0.2 * height * ramp),
             uncertainties={k: s for k, s in spreads.items() if k not in ("delay", "stress_scale")},

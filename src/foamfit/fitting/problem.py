@@ -294,7 +294,8 @@ class Problem:
     @cached_property
     def tied(self) -> Tied | None:
         """A function that sets the parameters given by expressions; None without any."""
-        expressions = {name: one.expr for name, one in self.params.items() if one.expr is not None}
+        each = {name: self.params[name].expr for name in self.names}
+        expressions = {name: expr for name, expr in each.items() if expr is not None}
         if [*expressions.values()] == [_rest_of_height(self.measurement, self.model)]:
             first, last = self.index["s1_height"], self.index[f"s{len(self.model.kinds)}_height"]
             height = self.measurement.specimen.height

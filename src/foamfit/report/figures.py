@@ -160,9 +160,10 @@ def images(figure: Figure, *forms: Format, dpi: int = DPI) -> list[bytes]:
         if engine is not None:
             engine.execute(figure)
             figure.set_layout_engine(None)
-        files = [_file(figure, form, dpi) for form in forms]
-        figure.set_layout_engine(engine)
-    return files
+        try:
+            return [_file(figure, form, dpi) for form in forms]
+        finally:
+            figure.set_layout_engine(engine)
 
 
 def _file(figure: Figure, form: Format, dpi: int) -> bytes:

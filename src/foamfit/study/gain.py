@@ -17,7 +17,6 @@ from functools import cached_property
 import numpy as np
 
 from foamfit.arrays import Array, Mask
-from foamfit.data.measurement import MEASURED
 from foamfit.data.rig import Candidate, Rig
 from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError, SimulationError
@@ -124,10 +123,7 @@ def problem_for(
     impact = candidate.drive == "impact"
     if impact:
         lasts, peak = _duration_and_peak(known, candidate, peak)
-    record = candidate.recorded(test, rig, lasts, peak)
-    if with_motion and record.stress is not None:
-        moved = 0.5 * test.specimen.height * np.linspace(0.0, 1.0, record.stress.size)
-        record = replace(record, displacement=moved, motion=MEASURED)
+    record = candidate.recorded(test, rig, lasts, peak, with_motion=with_motion)
     inside = problem.objective.interior_mass and impact
     law, terms = problem.model.name, problem.model.relaxation
     return make_problem(record, law, candidate.drive, None, None, inside, relaxation=terms)
