@@ -54,7 +54,7 @@ class Here(Worker):
     def __init__(self, job):
         self.job, self.news, self.told, self.stopping = job, News(), "", False
         self.ended = None
-        self._pipe, there = worker_module.PROCESSES.Pipe()
+        self._pipe, there = worker_module.processes().Pipe()
         self.process = SimpleNamespace(join=lambda: None, kill=lambda: None)
         threading.Thread(target=self._listen, daemon=True).start()
         with there:

@@ -411,6 +411,7 @@ def test_a_dask_cluster_loses_a_worker_and_no_test(here):
             while not stamps("out"):
                 time.sleep(0.02)
             processes[1].kill()
+            processes[1].wait()  # until then its number is that of a process
 
         killer = threading.Thread(target=kill, daemon=True)
         try:

@@ -14,8 +14,8 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cache as once
 from functools import partial
-from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,13 +25,13 @@ from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.solve import cache
 from foamfit.solve.precompile import LOOPS, compile_solver
 from foamfit.springs import laws
+from foamfit.study.processes import FITS, PAGES, context_of
 from foamfit.terminal import ending_cleanly, without_ctrl_c
 
 if TYPE_CHECKING:
     from foamfit.arrays import Array
     from foamfit.fitting.problem import Problem
 
-PROCESSES = get_context("spawn")
 COMPILING = "compiling the solver, once after installation"
 STOP = "stop"
 STOPPED_EARLY = "The fit was stopped before it had a result; start it again."
@@ -63,6 +63,12 @@ class News:
     misfit: dict[str, float | None] = field(default_factory=dict)
 
 
+@once
+def processes() -> Any:
+    """Return the context of the page's processes, which share the imports of a fit."""
+    return context_of(("foamfit.cli.fit", *FITS, *PAGES))
+
+
 class Worker:
     """A fit in another process: its last report, and how it ended."""
 
@@ -71,8 +77,8 @@ class Worker:
         self.stopping = False
         self.told = ""  # text that the command prints for several cycles
         self.ended: str | None = None  # after the end: why there is no result, or ""
-        self._pipe, there = PROCESSES.Pipe()
-        self.process = PROCESSES.Process(target=run, args=(job, there), daemon=True)
+        self._pipe, there = processes().Pipe()
+        self.process = processes().Process(target=run, args=(job, there), daemon=True)
         self.process.start()
         there.close()  # so that the pipe ends with the process
         threading.Thread(target=self._listen, daemon=True).start()
@@ -114,7 +120,7 @@ class FirstUse:
     """
 
     def __init__(self) -> None:
-        self.process = PROCESSES.Process(target=_compile, daemon=True)
+        self.process = processes().Process(target=_compile, daemon=True)
         pool = ThreadPoolExecutor(1, thread_name_prefix="foamfit-compiling")
         self.done: Future[None] = pool.submit(self._compile)
 
@@ -133,7 +139,7 @@ class FirstUse:
 
 
 def _leave_terminal() -> None:
-    """Keep Ctrl-C in the terminal from this process: the server ends it."""
+    """Keep Ctrl-C in the terminal from this process: the server of the page ends it."""
     if hasattr(os, "setpgrp"):  # not on Windows
         os.setpgrp()
 
@@ -233,5 +239,6 @@ def _wait_for_stop(pipe: Connection) -> None:
 def run(job: Job, pipe: Connection) -> None:
     """Run a job; reports, and in the end its outcome, go to a pipe."""
     _leave_terminal()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # by which a fit is stopped
     with ending_cleanly():
         pipe.send(_fitted(job, _Teller(pipe)))

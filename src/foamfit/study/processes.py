@@ -46,24 +46,33 @@ def cores() -> int:
     return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
+def context_of(preload: Iterable[str]) -> Any:
+    """Return the context of multiprocessing whose processes start fastest.
+
+    They are forked from a server that imports the modules `preload` and ignores Ctrl-C; where there
+    is none, as on Windows, every process imports them itself.
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    from multiprocessing import forkserver  # not on Windows
+
+    with _starting(), without_ctrl_c():  # Ctrl-C must not end the server in its imports
+        forkserver.set_forkserver_preload(list(preload))
+        forkserver.ensure_running()
+    return multiprocessing.get_context("forkserver")
+
+
 class Processes(ThreadPoolExecutor):
     """An executor with `count` single-threaded processes, which end with their parent process.
 
     A call whose process ends raises `EndedError`; other calls are not affected. Functions must be
-    defined in modules. The running script is not imported again and needs no guard. `preload` are
-    modules that the server imports from which processes are forked, where there is one.
+    defined in modules. The running script is not imported again and needs no guard. For `preload`
+    see `context_of`.
     """
 
     def __init__(self, count: int, preload: Iterable[str] = ()) -> None:
         super().__init__(count, thread_name_prefix="foamfit")
-        server = "forkserver" in multiprocessing.get_all_start_methods()
-        self._context: Any = multiprocessing.get_context("forkserver" if server else "spawn")
-        if server:
-            from multiprocessing import forkserver  # not on Windows
-
-            with _starting(), without_ctrl_c():  # Ctrl-C must not end the server in its imports
-                forkserver.set_forkserver_preload(list(preload))
-                forkserver.ensure_running()
+        self._context = context_of(preload)
         self._pools = dict[int, ProcessPoolExecutor]()  # by the thread that uses it
         self._stop, self._stopping = self._context.Pipe(duplex=False)
 
