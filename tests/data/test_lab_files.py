@@ -111,6 +111,27 @@ def test_columns_may_be_separated_by_blanks(tmp_path, head, decimal):
     assert test.rows.rows == N
 
 
+@pytest.mark.parametrize(
+    ("head", "day", "sep", "decimal"),
+    [
+        ("Time", "", ",", "."),
+        ("Time (hh:mm:ss)", "2026-05-03 ", "\t", "."),
+        ("Zeit", "3/5/2026 ", ";", ","),
+    ],
+)
+def test_a_time_of_day(tmp_path, head, day, sep, decimal):
+    of_day = [
+        f"{day}{t // 3600:.0f}:{t // 60 % 60:02.0f}:{t % 60:07.4f}".replace(".", decimal)
+        for t in 9 * 3600 + 59 * 60 + 41 + TIME
+    ]
+    others = rows(FORCE, MOTION, sep=sep, decimal=decimal)
+    body = [sep.join(row) for row in zip(of_day, others, strict=True)]
+    path = write(tmp_path, [sep.join([head, "force (N)", "displacement (mm)"]), *body])
+    expect(read_test(path))
+    path.write_text(path.read_text().replace(f":41{decimal}1875", ":61"))
+    refused(path, "row 3", "9:59:61'; it must be a number")
+
+
 def test_columns_of_fixed_width(tmp_path):
     width = "{:>10}{:>18}{:>22}{:>8}"
     head = [

@@ -30,6 +30,8 @@ _ABOVE = 40  # number of rows compared with the last row
 _NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?)", re.IGNORECASE | re.ASCII
 )
+# A time of day such as 12:00:00.5, with or without a date before it.
+_OF_DAY = re.compile(r"(?:[\d./-]+[T ]+)?(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,]\d+)?)", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,11 @@ class Table(Text):
         text = self.headers[column].text
         unique = sum(header.text == text for header in self.headers) == 1
         return repr(text) if unique else f"{text!r} (number {column + 1})"
+
+    def is_of_day(self, column: int) -> bool:
+        """Return whether the first cell of a column is a time of day."""
+        first = next((cells[column] for _, cells in self.rows() if len(cells) > column), "")
+        return _OF_DAY.fullmatch(first.strip()) is not None
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield (row number in the file, cells) of the lines that are not blank."""
@@ -205,7 +212,8 @@ def _score(cells: list[str], names: set[str]) -> int:
 
 
 def _is_number(cell: str) -> bool:
-    return _NUMBER.fullmatch(cell.strip().replace(",", ".")) is not None
+    cell = cell.strip()
+    return bool(_NUMBER.fullmatch(cell.replace(",", ".")) or _OF_DAY.fullmatch(cell))
 
 
 def _holds_numbers(cells: list[str]) -> bool:
@@ -280,7 +288,7 @@ def read_numbers(
 ) -> tuple[dict[str, Array], Integers, Integers]:
     """Read columns without conversion; return numbers, row numbers, and rows without numbers.
 
-    InputError names the first cell that is not a number.
+    Times of day are converted to seconds. InputError names the first cell that is not a number.
     """
     places, empty = list(columns.values()), list[int]()
     read = _plain_numbers(table, places)
@@ -339,6 +347,11 @@ def _checked_numbers(table: Table, columns: dict[str, int]) -> tuple[Array, Inte
                 )
             empty.append(row)
             continue
+        of_day = _OF_DAY.fullmatch(cells[columns["time"]]) if "time" in columns else None
+        if of_day is not None:
+            hours, minutes, seconds = (float(one.replace(",", ".")) for one in of_day.groups())
+            total = repr(3600.0 * hours + 60.0 * minutes + seconds)
+            cells[columns["time"]] = total.replace(".", table.decimal)
         wrongs = ((table.headers[k].text, _wrong(cells[k], table.decimal)) for k in places)
         if bad := next((f"{name!r} is {wrong}" for name, wrong in wrongs if wrong), None):
             below.append((row, InputError(f"row {row}, column {bad}.")))
