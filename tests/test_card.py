@@ -181,6 +181,22 @@ def test_what_the_card_loses_is_said(fit: Path, joint: Path) -> None:
 
 
 @needs_data
+def test_scale_and_delay_of_a_record_are_no_misfit_of_the_card(tmp_path: Path) -> None:
+    plain, late, scale = write_fit(tmp_path / "plain", 0.25), 0.02, 1.08
+    c = plain.curves
+    read = replace(
+        c,
+        measured_stress=c.measured_stress / scale,
+        stress_along=c.stress_along / scale,
+        measured_displacement=np.interp(c.time - late, c.time, c.measured_displacement),
+    )
+    values = {"force_scale": scale, "time_shift": late}
+    more = {name: fabricated.estimate(name, value) for name, value in values.items()}
+    other = replace(plain, curves=read, parameters=plain.parameters | more)
+    first, second = (ff.card(one, format="mat083").misfit["card"] for one in (plain, other))
+    assert second == pytest.approx(first, rel=0.1)
+
+
 def test_on_real_foam_three_parameters_lose_little_and_two_more(tmp_path: Path) -> None:
     file = thinned(DATA / "shoe-foam" / "turbo-comp-1_cycle1.csv", tmp_path, 4)
     test = ff.read_test(file, specimen_toml(tmp_path, 10.53, 7.63))

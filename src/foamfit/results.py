@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from foamfit.trust.identifiability import Insight
 
+_Stress = TypeVar("_Stress", float, Array)
 SCHEMA = 1
 # Sources of an uncertainty budget; those in `STATED` have a ± in the TOML and are not fitted.
 STATED = ("mass", "height", "area", "calibration")
@@ -346,11 +347,21 @@ class Fit:
         moved = c.displacement if c.displacement is not None else c.measured_displacement
         return None if moved is None else moved / self.measurement.specimen.height
 
+    def nuisance(self, name: str, exact: float = 0.0) -> float:
+        """Return a nuisance parameter of the measured curves, SI; `exact` if it was not fitted.
+
+        Zeros and times are counted from those that the preparation has taken off.
+        """
+        fitted = self.parameters.get(name)
+        return fitted.value - self.measurement.origins.get(name, 0.0) if fitted else exact
+
     def zero_of(self, channel: str) -> float:
         """Return the fitted zero of a channel in the measured curves, Pa or m; 0 if exact."""
-        name = f"{channel}_zero"
-        fitted = self.parameters.get(name)
-        return fitted.value - self.measurement.origins.get(name, 0.0) if fitted else 0.0
+        return self.nuisance(f"{channel}_zero")
+
+    def as_read(self, stress: _Stress) -> _Stress:
+        """Return a stress as the measured curves show it: with its fitted scale and zero, Pa."""
+        return stress / self.nuisance("force_scale", 1.0) + self.zero_of("stress")
 
     @property
     def loop(self) -> Loop | None:

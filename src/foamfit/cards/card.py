@@ -70,17 +70,24 @@ class Record:
 
     @classmethod
     def of(cls, result: Fit) -> Record:
-        """Return the record of a fit, with the fitted zeros of the channels subtracted."""
+        """Return the record of a fit without its fitted zeros, scale of the force and delay."""
         test, c, impact = result.measurement, result.curves, result.drive == "impact"
         measured, specimen = c.measured_displacement, test.specimen
         moved = c.displacement if measured is None else measured
         if c.measured_stress is None or moved is None:
             raise InputError(f"{test.name} has no measured loop; a card needs force and motion")
         fitted = c.stress if impact else c.stress_along
+        stress, fitted = (
+            result.nuisance("force_scale", 1.0) * (one - result.zero_of("stress"))
+            for one in (c.measured_stress, c.measured_stress if fitted is None else fitted)
+        )
         strain, motion = (
             (one - result.zero_of("displacement")) / specimen.height
             for one in (moved, c.displacement if impact and c.displacement is not None else moved)
         )
+        late, time = result.nuisance("time_shift"), c.time
+        if late and time is not None:
+            strain, motion = (np.interp(time + late, time, one) for one in (strain, motion))
         # The law of a record without time does not depend on time.
         steps = np.abs(np.diff(motion, prepend=motion[0])) + 1e-9
         mass, volume = specimen.mass, specimen.height * specimen.area
@@ -88,9 +95,9 @@ class Record:
             rate=loading_rate(test),
             time=np.cumsum(steps) if c.time is None else c.time,
             strain=strain,
-            stress=c.measured_stress - result.zero_of("stress"),
+            stress=stress,
             motion=motion,
-            fitted=(c.measured_stress if fitted is None else fitted) - result.zero_of("stress"),
+            fitted=fitted,
             misfit=result.misfit["stress_time" if impact else "stress_strain"],
             density=None if mass is None else mass / volume,
         )

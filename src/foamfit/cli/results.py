@@ -152,7 +152,8 @@ def predict(
                 metavar="RIG.toml")  # fmt: skip
 @options.option(
     "--for quantity",
-    "What the foam is needed for: peak_force, absorbed_energy or peak_strain at a velocity.",
+    "What the foam is needed for: peak_force, peak_strain, absorbed_energy or dissipated_energy "
+    "at a velocity.",
     metavar='"peak_force at 3 m/s"',
 )
 @options.declared("seed", help="The same results, rig and seed give the same numbers.")

@@ -116,6 +116,7 @@ def read_test(
             striker=settings.striker,
             window=window,
             spread=settings.uncertainties.get("velocity", 0.0),
+            stated=settings.noise,
         )
     for channel, unit in (("stress", "Pa"), ("displacement", "m")):
         size, sigma = float(np.ptp(test.channels()[channel])), getattr(settings.noise, channel)
@@ -136,7 +137,6 @@ def read_test(
         data_sha256=sha256,
         uncertainties=spreads | settings.uncertainties,
         turned=turned,
-        noise=replace(settings.noise, estimated=test.noise.estimated),
         priors=settings.priors,
         entries=entries,
     )

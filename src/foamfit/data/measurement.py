@@ -83,11 +83,16 @@ class Noise:
     displacement: float | None = None
     estimated: dict[str, NoiseLevel] = field(default_factory=dict)
 
+    @property
+    def levels(self) -> dict[str, NoiseLevel]:
+        """The noise of stress and displacement from the TOML, where given."""
+        every = ("stress", self.stress), ("displacement", self.displacement)
+        return {c: NoiseLevel(sigma, True, "given") for c, sigma in every if sigma is not None}
+
     def of(self, channel: str) -> NoiseLevel | None:
         """Return the noise of a channel, from the TOML if given there; None if unknown."""
-        stated = {"stress": self.stress, "acceleration": None}
-        given = stated.get(channel, self.displacement)
-        return self.estimated.get(channel) if given is None else NoiseLevel(given, True, "given")
+        stated = channel if channel in ("stress", "acceleration") else "displacement"
+        return self.levels.get(stated) or self.estimated.get(channel)
 
 
 @dataclass(frozen=True, eq=False)

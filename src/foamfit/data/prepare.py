@@ -59,13 +59,15 @@ def condition(
     striker: Striker | None = None,
     window: Window | None = None,
     spread: float = 0.0,
+    stated: Noise | None = None,
 ) -> Measurement:
     """Reduce all samples of a file to one loading and unloading; the test has no name yet.
 
     A record with a striker and a time is an impact, any other a slow test. Channels are positive
     in compression. `spread` is the standard deviation of the striker's velocity, m/s. The result
     has at most 1500 samples, and time and displacement are zero at the start of contact. The noise
-    is estimated from samples before contact or from those of a held channel.
+    is estimated from samples before contact or from those of a held channel, or that of the samples
+    is `stated`.
     """
     window, given = window or Window(), striker or Striker()
     impact = striker is not None and record.time is not None
@@ -122,7 +124,7 @@ def condition(
         excess,
         specimen=specimen,
         striker=striker and given,
-        noise=Noise(estimated=noise),
+        noise=replace(_stated_of_blocks(stated or Noise(), levels, whole, block), estimated=noise),
         contact="stress" if used.place else start.by,
         cycle=used.number,
         cycles=tuple(cycle.number for cycle in found) or (1,),
@@ -130,6 +132,18 @@ def condition(
         rise=rise and rise._replace(time=rise.time - contact_time),
         flight=flight,
     )
+
+
+def _stated_of_blocks(stated: Noise, levels: contact.Levels, record: Record, block: int) -> Noise:
+    """Return the stated noise of samples for means of blocks; `levels` give its correlation."""
+
+    def of(name: str) -> float | None:
+        if (level := stated.levels.get(name)) is None:
+            return None
+        level = replace(level, time=levels[name].time if name in levels else 1.0)
+        return frames.noise_of_blocks(level, block, record.sampled.get(name)).sigma
+
+    return Noise(of("stress"), of("displacement"))
 
 
 def _contact_of_impact(

@@ -150,8 +150,9 @@ class Candidate:
         """Return a record of this test of the specimen of `test`; its values are placeholders.
 
         An impact `lasts` some time (s), and `peak` is the largest stress (Pa). The motion is that
-        of `test`, or measured `with_motion`. Noise that the TOML
-        of `test` does not state counts as estimated, as in a fit.
+        of `test`, or measured `with_motion`. The motion of a slow test has no noise, those inside
+        have that of the rig. Noise that the TOML of `test` does not state counts as estimated, as
+        in a fit.
         """
         height, known, spreads = test.specimen.height, test.noise, dict(test.uncertainties)
         striker = None
@@ -166,14 +167,15 @@ class Candidate:
                 spreads["velocity"] *= self.velocity / was
         else:
             time, moved = self.motion(height)
-        estimated = dict[str, NoiseLevel]()
-        for channel, sigma in rig.noise.items():
-            given = getattr(known, channel) is not None
-            size = 0.0 if channel == "displacement" and striker is None else sigma
-            estimated[channel] = NoiseLevel(size, given, "the rig")
+        levels = {
+            channel: NoiseLevel(sigma, getattr(known, channel) is not None, "the rig")
+            for channel, sigma in rig.noise.items()
+        }
         seen = {*test.interior, *([] if self.interior is None else [self.interior])}
         ramp = np.linspace(0.0, 1.0, time.size)
-        levels = estimated | {interior_channel(node): estimated["displacement"] for node in seen}
+        levels |= {interior_channel(node): levels["displacement"] for node in seen}
+        if striker is None:
+            levels["displacement"] = replace(levels["displacement"], sigma=0.0)
         return Measurement(
             name=str(self), path=None, data_sha256="", time=time, displacement=moved,
             stress=peak * ramp, specimen=test.specimen, striker=striker,

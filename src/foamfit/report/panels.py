@@ -330,8 +330,7 @@ def _points(panel: Panel, result: Fit) -> Iterator[tuple[str, str, float, float]
             x = moved / result.measurement.specimen.height
         remembers = result.chain.springs[switch.spring - 1].law.remembers
         if x is not None and not (name is None and remembers):
-            stress = switch.stress + result.zero_of("stress")
-            y = moved if panel.name == "displacement-time" else stress
+            y = moved if panel.name == "displacement-time" else result.as_read(switch.stress)
             yield f"s{switch.spring}", name or "→".join(ends), x, y
     for spring, snapped in result.snapping.items():
         for symbol, sample in zip(("σ₊", "σ₋"), snapped.halves, strict=True):
@@ -346,11 +345,11 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
         return
     (left, right), (low, top) = ax.get_xlim(), ax.get_ylim()
     ax.set(xlim=(left, right), ylim=(low, top))  # the branches extend beyond the panel
-    zero = result.zero_of("stress")
+    scale, zero = result.nuisance("force_scale", 1.0), result.zero_of("stress")
     moved = result.zero_of("displacement") / result.measurement.specimen.height
-    stress = np.linspace(0.0, top * labels.fy - zero, 200)
+    stress = np.linspace(0.0, scale * (top * labels.fy - zero), 200)
     for name, strain in spring.elastic_branches(stress).items():
-        line = np.column_stack((strain + moved, (stress + zero) / labels.fy))
+        line = np.column_stack((strain + moved, result.as_read(stress) / labels.fy))
         line = line[strain + moved < right]
         if len(line):  # branch c may lie beyond the strains of the test
             ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5, label=f"_branch {name}")
@@ -358,7 +357,7 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
             labels.write(name, [at], color=GREY, fontsize=7)
     if spring.relaxation and "s1" in result.snapping and result.strain is not None:
         style: Any = {"color": "0.35", "lw": 0.7, "ls": (0, (4, 2)), "zorder": 3.5}
-        equilibrium = (result.snapping["s1"].stress + zero) / labels.fy
+        equilibrium = result.as_read(result.snapping["s1"].stress) / labels.fy
         ax.plot(result.strain, equilibrium, label="equilibrium", **style)
 
 
@@ -400,7 +399,7 @@ def _switch_samples(result: Fit, loop: Line) -> list[int]:
         else:  # the nearest sample after the previous switch
             moved = switch.displacement + result.zero_of("displacement")
             strain = moved / result.measurement.specimen.height
-            stress = switch.stress + result.zero_of("stress")
+            stress = result.as_read(switch.stress)
             x, y = loop.x[samples[-1] :] - strain, loop.y[samples[-1] :] - stress
             distance = np.hypot(x / (np.ptp(loop.x) or 1.0), y / (np.ptp(loop.y) or 1.0))
             samples.append(samples[-1] + int(np.argmin(distance)))

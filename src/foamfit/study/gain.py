@@ -33,7 +33,8 @@ from foamfit.trust.ranges import ALIKE
 TINY, ROUNDING = 1e-6, 1e-12  # least information on a scaled parameter, and over the largest one
 LONGEST = 30.0  # longest contact, in times that the striker takes over the height of the specimen
 TIMED = 20  # number of draws from which the duration of an impact is taken
-UNITS = {"peak_force": "N", "absorbed_energy": "J", "peak_strain": ""}  # quantities of `Target`
+# Quantities of `Target`; the absorbed energy is that up to the largest strain.
+UNITS = {"peak_force": "N", "absorbed_energy": "J", "dissipated_energy": "J", "peak_strain": ""}
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,17 +322,19 @@ class Target:
         if name == "peak_strain":
             at = int(np.argmax(moved))
             return float(moved[at]) / specimen.height, by_motion[:, at] / specimen.height
-        work = np.trapezoid(stress, moved)
-        slopes = np.trapezoid(by_stress, moved, axis=1)
-        slopes += np.trapezoid(stress * np.gradient(by_motion, axis=1), axis=1)
-        return float(work) * specimen.area, slopes * specimen.area
+        end = int(np.argmax(moved)) + 1 if name == "absorbed_energy" else moved.size
+        stress, moved, by_stress = stress[:end], moved[:end], by_stress[:, :end]
+        middle = 0.5 * (stress[1:] + stress[:-1]) * specimen.area
+        slopes = np.trapezoid(by_stress, moved, axis=1) * specimen.area
+        slopes += np.diff(by_motion[:, :end], axis=1) @ middle
+        return float(middle @ np.diff(moved)), slopes
 
     def error(self, known: Known, seen: Sequence[Seen]) -> float:
         """Return the standard error of the quantity after some tests, RMS of the draws, over it."""
         noise, law = covariance(known, seen, 1.0 / NOTHING**2)
         total = noise + law / NORMAL**2
         variance = np.einsum("di,dij,dj->d", self.slopes, total, self.slopes)
-        return math.sqrt(max(float(np.nanmean(variance)), 0.0)) / abs(self.middle)
+        return math.sqrt(max(float(np.nanmean(variance)), 0.0)) / (abs(self.middle) or math.nan)
 
     @property
     def middle(self) -> float:
