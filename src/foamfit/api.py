@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 class FitResult(Result, Fit):
     """Result of a fit: parameters, intervals, curves, status and warnings."""
 
+    _kind = "fit.json"
     write, to_json_dict = write_result, Fit.to_json_dict
 
     def plot(self, ax: Axes | None = None, what: str = "stress-strain") -> Axes:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import fabricated
+import foamfit as ff
 import foamfit.report.figures
 import foamfit.report.folder
 import foamfit.report.summary
@@ -138,6 +139,16 @@ def test_failing_midway_leaves_the_older_result(
     assert load_result(folder)["seed"] == 1
     assert {path.name for path in folder.iterdir()} == FILES
     assert [path.name for path in tmp_path.iterdir()] == ["r"]
+
+
+def test_another_kind_of_result_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "joint.json").write_text('{"schema": 1, "foamfit": "", "tests": {"slow": {}}}')
+    fabricated.result().save(tmp_path / "slow", report=False)
+    with pytest.raises(ff.InputError, match=r"joint\.json, which does not belong to a fit"):
+        fabricated.result().save(tmp_path, report=False)
+    assert (tmp_path / "slow" / "fit.json").is_file()
+    fabricated.result().save(tmp_path, report=False, force=True)
+    assert not (tmp_path / "slow").exists()
 
 
 @pytest.mark.parametrize(

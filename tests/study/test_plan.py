@@ -172,7 +172,9 @@ def test_a_rival_law_is_told_apart_by_a_test_beyond_the_first(soft):
     assert found.advice.apart["microscale"] > again.apart["microscale"]
 
 
-@pytest.mark.parametrize("name", ["peak_force", "peak_strain", "absorbed_energy", "dissipated_energy"])
+@pytest.mark.parametrize(
+    "name", ["peak_force", "peak_strain", "absorbed_energy", "dissipated_energy"]
+)
 @pytest.mark.parametrize("motion", [MEASURED, INTEGRATED])
 def test_slopes_of_a_quantity_are_its_differences(name, motion):
     """A motion that was integrated from the force has slopes as well; their loss promised ±0."""

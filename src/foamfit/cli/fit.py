@@ -185,4 +185,4 @@ def fit(
     with progress_line(output.silent, "fit", says=not output.quiet) as news:
         found = replace(ready.fit(news), options=made)
     page = folder / ("report.html" if ready.several is None else "cycles.png")
-    return output.finish(found, page, check=check, verbose=verbose)
+    return output.finish(found, page, check=check, verbose=verbose, force=force)

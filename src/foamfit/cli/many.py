@@ -160,7 +160,7 @@ def joint(study: Path, seed: int | None, output: Output) -> int:
     Also: seed, cycle, starts, and [specimens] with a TOML for single tests: new-heel-1 = "a.toml".
     """
     output.check(without_report=False)
-    folder = output.folder(Path("fits", study.stem))
+    folder = output.folder(Path("fits", study.stem), "joint.json")
     from foamfit.study.study_file import read_study
 
     read = read_study(study)

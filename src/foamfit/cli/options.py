@@ -170,16 +170,18 @@ class Output:
         *,
         check: Callable[[Path], object] = lambda _: None,
         verbose: bool = False,
+        force: bool = False,
     ) -> int:
         """Save a result in the folder of `page`, print it and its place; return the exit code.
 
-        If saving fails, the result is printed all the same. `check` may refuse a folder.
+        If saving fails, the result is printed all the same. `check` may refuse a folder; `force`
+        replaces a result of any kind.
         """
         from foamfit.report.folder import save_somewhere
 
         def save(place: Path, **how: Any) -> None:
             check(place)  # another fit may have written there in the meantime
-            found.save(place, figure_width=self.figure_width, **how)
+            found.save(place, figure_width=self.figure_width, force=force, **how)
 
         try:
             with progress_line(self.silent, "result") as line, without_ctrl_c():

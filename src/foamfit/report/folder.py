@@ -42,6 +42,7 @@ FILES = {
     "prediction.json": {f"prediction.{kind}" for kind in _KINDS},
     "plan.json": {*(f"plan.{kind}" for kind in _KINDS), "next.toml", "joint.toml"},
 }
+_OF_FITS = "fit.json", "cycles.json", "batch.json"  # of fits of one record, one by one
 
 
 def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool = False) -> Path:
@@ -155,9 +156,17 @@ def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
     present = sorted(place.iterdir())
-    if present and not any(_content(place / name) for name in FILES):
+    kinds = [name for name in FILES if _content(place / name)]
+    if present and not kinds:
         raise InputError(
             f"{folder} is not empty and contains no foamfit result (such as fit.json), so it is "
+            "not replaced; choose a new or an empty folder"
+        )
+    own = _OF_FITS if of in _OF_FITS else (of,)
+    other = [] if of is None else [name for name in kinds if name not in own]
+    if other:
+        raise InputError(
+            f"{folder} holds {other[0]}, which does not belong to a {Path(str(of)).stem}, so it is "
             "not replaced; choose a new or an empty folder"
         )
     tests = _content(place / "joint.json").get("tests")  # folders of a joint fit
@@ -166,11 +175,6 @@ def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
             raise InputError(
                 f"{folder} holds {path.name}, which foamfit did not write, so it is not replaced; "
                 "move that or choose another folder"
-            )
-        if of is not None and path.name not in FILES[of]:
-            raise InputError(
-                f"{folder} holds {path.name}, which does not belong to a {Path(of).stem}, so it is "
-                "not replaced; choose a new or an empty folder"
             )
 
 

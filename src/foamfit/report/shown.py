@@ -23,8 +23,7 @@ def brief(title: str, line: str, rows: Sequence[Readable]) -> str:
 class Result:
     """A result that Python shows in a few lines and a folder keeps."""
 
-    # The only kind of result, one of `folder.FILES`, that it may replace; None: any.
-    _replaces: ClassVar[str | None] = None
+    _kind: ClassVar[str]  # the file that identifies it, one of `folder.FILES`
 
     def write(self, folder: Path, *, pages: bool, width: str) -> None:
         """Write all files into an existing folder; pages and figures only with `pages`."""
@@ -53,12 +52,14 @@ class Result:
         *,
         report: bool = True,
         figure_width: str = TWO,
+        force: bool = False,
     ) -> Path:
         """Write the result folder and return its path; an older folder is replaced at the end.
 
-        Without `report`, neither pages nor figures are written. `figure_width` is "one" or "two"
-        columns, or a length ("85 mm"); ", untitled" after it omits the titles.
+        A result of another kind, such as a joint fit, is replaced only with `force`. Without
+        `report`, neither pages nor figures are written. `figure_width` is "one" or "two" columns,
+        or a length ("85 mm"); ", untitled" after it omits the titles.
         """
         inches(figure_width)  # rejects an invalid width
-        check_target(folder, of=self._replaces)
+        check_target(folder, of=None if force else self._kind)
         return save_whole(folder, partial(self.write, pages=report, width=figure_width))

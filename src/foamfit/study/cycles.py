@@ -56,6 +56,7 @@ BY_CYCLE = {
 class CycleFits(Result):
     """Fits of the cycles of one record."""
 
+    _kind = "cycles.json"
     test: str  #: Name of the test
     model: str  #: Name of the model
     recorded: tuple[int, ...]  #: Numbers of all cycles in the record

@@ -91,7 +91,7 @@ def joint(
     study = path if isinstance(path, Study) else read_study(path)
     study = study if seed is None else replace(study, seed=seed)
     if out is not None:
-        check_target(out)
+        check_target(out, of="joint.json")
     options = Options(
         drive=study.drive, seed=study.seed, starts=study.starts, relaxation=study.relaxation
     )

@@ -70,6 +70,7 @@ class JointResult(Result):
     scattering parameters between specimens.
     """
 
+    _kind = "joint.json"
     name: str  #: Name of the study
     model: str  #: See `Model.name`
     tests: dict[str, JointTest]

@@ -157,7 +157,7 @@ class Plan(Result):
         """Return names of parameters, without the spring if there is only one."""
         return [own_name(name, self.model) for name in names]
 
-    _replaces = "plan.json"
+    _kind = "plan.json"
 
     def __repr__(self) -> str:
         """Return the advice."""

@@ -120,7 +120,7 @@ class Prediction(Result):
     #: from the origins of the file.
     aligned: dict[str, float] = field(default_factory=dict)
 
-    _replaces = "prediction.json"  # a result of another kind may be its source
+    _kind = "prediction.json"
 
     def __repr__(self) -> str:
         """Return the sentences on the prediction."""
