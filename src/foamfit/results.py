@@ -62,7 +62,7 @@ class Loop(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Correlation:
-    """Correlation matrix of the identified parameters, in the order of `names`.
+    """Correlation matrix of the identified parameters and of those that follow from them.
 
     `stderr` are the local standard errors, SI, including those of undetermined parameters; NaN
     where the data fix only a combination.
@@ -279,6 +279,8 @@ class Fit:
     # Samples of a Markov chain, (walkers, steps) by parameter, SI; empty without a chain
     draws: dict[str, Array] = field(default_factory=dict)
     contradictions: tuple[Contradiction, ...] = ()  # of the record, which the fit does not settle
+    # All parameters at which the weights due to an uncertain motion were found, SI; empty without
+    weighed_at: tuple[float, ...] = ()
     # The problem of the fit, and what the fit cost (`fitting.objective.Effort`); not in its folder
     problem: Any = field(default=None, repr=False)
     effort: Any = None

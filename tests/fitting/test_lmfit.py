@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import synthetic_impact, synthetic_loop
+from conftest import EXPERIMENTS, synthetic_impact, synthetic_loop
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +63,15 @@ def test_a_result_read_back_has_the_same_objects(result, tmp_path):
         for one in (result, again)
     )
     assert np.array(second["s1_k0"]) == pytest.approx(np.array(first["s1_k0"]), rel=1e-6)
+
+
+def test_the_weights_due_to_a_noisy_motion_are_read_back(tmp_path):
+    test = ff.read_test(EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv")
+    result = ff.fit(test, drive="displacement", starts=4, intervals="local")
+    assert result.weighed_at
+    again = ff.load(result.save(tmp_path / "result", report=False))
+    residual = again.minimizer.userfcn(again.params)
+    assert float(residual @ residual) == pytest.approx(result.statistics["chisqr"], rel=1e-9)
 
 
 def test_an_undetermined_parameter_is_held():

@@ -96,7 +96,18 @@ def test_fixed_values_bounds_and_expressions_are_kept():
     assert (tied.state, tied.stderr) == ("fixed", pytest.approx(share * of.stderr))
     assert tied.ci95 == pytest.approx([share * end for end in of.ci95])
     assert result.lmfit.params["s1_kh_minus"].stderr == tied.stderr
+    names, matrix = result.correlation.names, result.correlation.matrix
+    rows = [matrix[names.index(f"s1_kh_{side}")] for side in ("plus", "minus")]
+    assert rows[0] == pytest.approx(rows[1], nan_ok=True)
     assert result.parameters["s1_eps_c"].state == "weak"  # the true value lies outside the bound
+
+
+@pytest.mark.parametrize("name", ["s1_eta", "displacement_zero"])
+def test_an_expression_has_no_nuisance_parameter(name):
+    params = make_params(synthetic_impact()[1])
+    params[name].set(expr="contact_time * 1e6 + 20")
+    with pytest.raises(ff.InputError, match=f"the expression {name} = .* has contact_time"):
+        ff.fit(synthetic_impact()[1], params=params)
 
 
 def test_contact_and_zero_are_reported_in_the_numbers_of_the_file():

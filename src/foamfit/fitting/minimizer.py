@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import lmfit
@@ -36,6 +37,11 @@ def problem_of(fit: Fit) -> Problem:
         fit.measurement, fit.model, fit.drive, fit.params, fit.weights, fit.interior_mass,
         time_shift="time_shift" in fit.params, relaxation=fit.relaxation, priors=fit.priors,
     )  # fmt: skip
+    smoothed = (one.get("motion_smoothed", True) for one in fit.noise.values())
+    if fit.drive == "displacement" and not all(smoothed):
+        made = replace(made, objective=replace(made.objective, followed=(None,)))
+    if fit.weighed_at:
+        made.objective.weigh_motion(np.array(fit.weighed_at))
     residual = made.objective.residual(made.vector())
     was = float(fit.statistics["chisqr"] or 0.0)
     if not math.isclose(float(residual @ residual), was, rel_tol=SAME, abs_tol=1e-9):

@@ -198,7 +198,7 @@ class Objective:
             max(NORMAL * float(np.median(part)), self.noise(name).sigma * self.factor(name), 1e-9)
             for name, part in self.by_curve(np.abs(plain)).items()
         ]
-        weighing = Weighing.of(uncertain, np.repeat(levels, self.sizes))
+        weighing = Weighing.of(uncertain, np.repeat(levels, self.sizes), values)
         if not weighing.explains(plain):
             self.unexplained = float(np.abs(weighing.amplitudes(plain)).max())
             return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -337,9 +338,20 @@ class Problem:
     def moves(self, values: Array, names: tuple[str, ...]) -> Array:
         """Return how all parameters move with each of these, (n_values, n_names)."""
         moves = np.eye(values.size)[:, [self.index[name] for name in names]]
-        if self.tied is None:
+        if self.tied is None or not names:
             return moves
         return follow(self.tied, values, moves, 1e-5 * self.sizes(names, values))
+
+
+def _check_expressions(params: lmfit.Parameters) -> None:
+    """Raise InputError for an expression with a nuisance parameter."""
+    for name, parameter in params.items():
+        used = {name, *re.findall(r"\w+", parameter.expr)} & {*NUISANCE} if parameter.expr else ()
+        if used:
+            raise InputError(
+                f"the expression {name} = {parameter.expr} has {min(used)}, which may be held "
+                "where the record shows it; only parameters of springs may be in an expression"
+            )
 
 
 def _check_held(params: lmfit.Parameters) -> None:
@@ -452,6 +464,7 @@ def make_problem(
                     "has nothing that would show it; leave it fixed"
                 )
             wanted[name].set(min=low, max=high)
+    _check_expressions(wanted)
     _counted_from(wanted, measurement.origins, -1.0)
     _check_held(wanted)
     _check_strain(wanted, measurement)

@@ -28,12 +28,13 @@ class Weighing:
     axes: Array
     less: Array
     sizes: Array  # d (m,)
+    at: Array  # the parameters at which it was found, SI
 
     @classmethod
-    def of(cls, uncertain: Array, levels: Array) -> Weighing:
+    def of(cls, uncertain: Array, levels: Array, at: Array) -> Weighing:
         """Make the transform from S (n, m) and √v (n,)."""
         axes, size, _ = np.linalg.svd(uncertain / levels[:, None], full_matrices=False)
-        return cls(levels, axes, 1.0 - 1.0 / np.sqrt(1.0 + size**2), size)
+        return cls(levels, axes, 1.0 - 1.0 / np.sqrt(1.0 + size**2), size, at)
 
     def amplitudes(self, residual: Array) -> Array:
         """Return the residual along the modes over its standard deviation, of modes with d > 1.

@@ -21,7 +21,7 @@ from foamfit.data.rig import Candidate, Rig
 from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.branches import unreached
-from foamfit.fitting.problem import Problem, make_problem
+from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.report.studies.plan import Expected, Quantity
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Impact
@@ -127,7 +127,11 @@ def problem_for(
     record = candidate.recorded(test, rig, lasts, peak, with_motion=with_motion)
     inside = problem.objective.interior_mass and impact
     law, terms = problem.model.name, problem.model.relaxation
-    return make_problem(record, law, candidate.drive, None, None, inside, relaxation=terms)
+    params = make_params(record, law, candidate.drive, relaxation=terms)
+    for name, one in problem.params.items():
+        if one.expr:
+            params[name].expr = one.expr
+    return make_problem(record, law, candidate.drive, params, None, inside, relaxation=terms)
 
 
 def _duration_and_peak(known: Known, candidate: Candidate, usual: float) -> tuple[float, float]:

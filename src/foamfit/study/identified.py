@@ -175,7 +175,8 @@ def _parameters(
             raise ValueError(f"it has no parameter {name} of its model {model.name}")
         one = springs.get(name, {"value": 0.0, "kind": "fixed"})
         try:
-            kind = one["kind"] if joint else "shared" if one.get("vary") else "fixed"
+            tied = one.get("stderr") and not name.endswith("_height")  # given by an expression
+            kind = one["kind"] if joint else "shared" if one.get("vary") or tied else "fixed"
             yield name, _parameter(kind, one)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueError(f"parameter {name}: {error}") from None

@@ -52,7 +52,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
             for name, process in zip(objective.counted, spread.noise, strict=True)
         }
         insight = look(best, noise)
-        correlation = Correlation(best.names, spread.correlation, spread.stderr)
+        correlation = _correlation(best)
     balance, misfit = audit(measurement), objective.misfit(simulated)
     contradictions = unsettled(best, balance.contradictions)
     settled = settle(best, contradictions)
@@ -100,6 +100,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         intervals=replace(intervals, draws={}),
         budget=budget,
         priors={prior.name: (prior.mean, prior.sigma) for prior in objective.given},
+        weighed_at=() if objective.weighing is None else tuple(objective.weighing.at.tolist()),
         problem=problem,
         effort=Effort(
             objective.evaluations,
@@ -235,6 +236,23 @@ def _estimates(
         parameter.stderr = estimate.stderr
         out[name] = estimate.counted_from(-problem.measurement.origins.get(name, 0.0))
     return out
+
+
+def _correlation(best: BestPoint) -> Correlation:
+    """Return the correlation of varied parameters, then of those given by expressions."""
+    spread, problem = best.spread, best.problem
+    tied = tuple(name for name in problem.names if problem.params[name].expr)
+    if not tied:
+        return Correlation(best.names, spread.correlation, spread.stderr)
+    moves = problem.moves(best.values, best.names)[[problem.index[name] for name in tied]]
+    change = np.where(moves == 0.0, 0.0, moves * spread.stderr)  # by one standard error of each
+    shared = change @ np.nan_to_num(spread.correlation)
+    variances = shared @ change.T
+    stderr = np.sqrt(np.maximum(np.diag(variances), 0.0))
+    with np.errstate(invalid="ignore", divide="ignore"):  # of one that depends on none of them
+        across, among = shared / stderr[:, None], variances / np.outer(stderr, stderr)
+    matrix = np.block([[spread.correlation, across.T], [across, among]])
+    return Correlation((*best.names, *tied), matrix, np.append(spread.stderr, stderr))
 
 
 def _of_tied(
