@@ -170,12 +170,13 @@ def _first_motion(time: Array, w: Array, noise: NoiseLevel) -> tuple[float, bool
     return first.value, top >= 5 and abs(first.value) > least  # not with fewer samples
 
 
-def start_of_impact(record: Record, levels: Levels) -> Start:
+def start_of_impact(record: Record, levels: Levels, *, late: bool = False) -> Start:
     """Estimate the start of an impact: stress or motion leaves its rest.
 
-    Without a force, contact starts where the flight decelerates. Without a rest, the first part of
-    the rise is extrapolated back to zero, by a few samples at most, unless the file's time zero is
-    at most two steps before the first sample.
+    A motion that may be `late` is used only if the stress has no rest. Without a force, contact
+    starts where the flight decelerates. Without a rest, the first part of the rise is extrapolated
+    back to zero, by a few samples at most, unless the file's time zero is at most two steps before
+    the first sample.
     """
     time, stress, w = record.instants, record.stress, record.displacement
     drift, at, elsewhere = _DRIFT, None, False
@@ -186,10 +187,10 @@ def start_of_impact(record: Record, levels: Levels) -> Start:
         leaves = partial(leave_rest, time, stress, levels["stress"], _STILL_IMPACT)
         at = leaves(drift * float(np.ptp(stress))) or (leaves() if elsewhere else None)
     start = _at_kink("stress", time, at, "stress") if at else _first_sample(record, levels)
-    if w is None:
+    if w is None or (late and start.free):
         return start
-    noise, up = levels["displacement"], slice(int(np.argmax(w)) + 1)
-    if at := leave_rest(time[up], w[up], noise, STILL_MOTION):
+    if at := motion_leaves_rest(record, levels):
+        up = slice(int(np.argmax(w)) + 1)
         # A motion that starts far from the onset of the stress is not due to contact.
         alike = abs(at[0] - start.time) < 0.1 * (time[up][-1] - start.time)
         if not start.free or (at[1] < start.error and alike):
@@ -200,6 +201,15 @@ def start_of_impact(record: Record, levels: Levels) -> Start:
         at = float(time[last]), _BRAKED * float(np.ptp(time))
         start = _at_kink("displacement", time, at, "motion", "line") if last else start
     return start
+
+
+def motion_leaves_rest(record: Record, levels: Levels) -> Kink | None:
+    """Find where the motion of an impact leaves its rest; None if it has none."""
+    w = record.displacement
+    if w is None:
+        return None
+    up = slice(int(np.argmax(w)) + 1)
+    return leave_rest(record.instants[up], w[up], levels["displacement"], STILL_MOTION)
 
 
 def _at_first(time: Array) -> Start:

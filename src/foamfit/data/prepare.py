@@ -60,6 +60,7 @@ def condition(
     window: Window | None = None,
     spread: float = 0.0,
     stated: Noise | None = None,
+    late: bool = False,
 ) -> Measurement:
     """Reduce all samples of a file to one loading and unloading; the test has no name yet.
 
@@ -67,7 +68,7 @@ def condition(
     in compression. `spread` is the standard deviation of the striker's velocity, m/s. The result
     has at most 1500 samples, and time and displacement are zero at the start of contact. The noise
     is estimated from samples before contact or from those of a held channel, or that of the samples
-    is `stated`.
+    is `stated`. A motion that may be `late` does not show the contact.
     """
     window, given = window or Window(), striker or Striker()
     impact = striker is not None and record.time is not None
@@ -88,7 +89,7 @@ def condition(
     levels = {c: estimated_noise(v) for c, v in curves.items()} | held
     flight = None
     if impact:
-        record, start, span = _contact_of_impact(record, levels, given)
+        record, start, span = _contact_of_impact(record, levels, given, late=late)
         first = record
         given, flight, notes = zeros.flight_of(record, start, span, levels, given, spread)
         record = record.noted(*notes)
@@ -105,7 +106,7 @@ def condition(
         record = cycles.zero_between(record, found, used)
         record = cycles.cut_to_cycle(record, found, chosen) if chosen else record
         record = cut_to_contact(record, start, span)
-    record = zeros.mark_flight(record, start, span) if impact else record
+    record = zeros.mark_flight(record, start, span, levels) if impact else record
     record = integrate_motion(record, specimen, given)
     if impact:
         record = start_within_height(record, specimen, given)
@@ -147,13 +148,13 @@ def _stated_of_blocks(stated: Noise, levels: contact.Levels, record: Record, blo
 
 
 def _contact_of_impact(
-    record: Record, levels: contact.Levels, striker: Striker
+    record: Record, levels: contact.Levels, striker: Striker, *, late: bool
 ) -> tuple[Record, contact.Start, zeros.Span]:
     """Return the record of an impact without drift, its start of contact, and its rows to keep."""
-    start = contact.start_of_impact(record, levels)
+    start = contact.start_of_impact(record, levels, late=late)
     straight = zeros.without_drift(record, start, levels)
     if straight is not record:
-        record, start = straight, contact.start_of_impact(straight, levels)
+        record, start = straight, contact.start_of_impact(straight, levels, late=late)
     if record.stress[start.first :].max() == 0.0:
         raise _never_positive(record.stress)
     start = replace(start, gauge=zeros.gauge_before(record, start, levels, striker))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.contact import ELSEWHERE, Levels, Start
+from foamfit.data.contact import ELSEWHERE, Levels, Start, motion_leaves_rest
 from foamfit.data.measurement import GRAVITY, UNITS, NoiseLevel, Record, Striker
 from foamfit.data.noise import (
     MIN_REST,
@@ -231,7 +231,7 @@ def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker)
     return "other"
 
 
-def mark_flight(record: Record, start: Start, span: Span) -> Record:
+def mark_flight(record: Record, start: Start, span: Span, levels: Levels) -> Record:
     """Mark rows in which the gauge does not follow the striker as not measured."""
     if record.displacement is None or start.gauge in ("flight", ""):
         return record
@@ -239,6 +239,8 @@ def mark_flight(record: Record, start: Start, span: Span) -> Record:
     moves = record.instants > max(2.5 * step, 2 * start.error)
     if start.gauge == "rest":
         moves[span.leaves - span.first :] = False
+        if at := motion_leaves_rest(record, levels):  # possibly late
+            moves &= record.instants > at[0] + max(2.5 * step, 2 * at[1])
     kept = record.sampled.get("displacement", np.ones(len(record), dtype=bool))
     return replace(record, sampled=record.sampled | {"displacement": kept & moves})
 

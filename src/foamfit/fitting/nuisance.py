@@ -109,17 +109,17 @@ def open_in(measurement: Measurement, drive: str, counted: Mapping[str, bool]) -
     return frozenset(moved | known)
 
 
-def shown_by(measurement: Measurement, drive: str) -> dict[str, Prior]:
+def shown_by(measurement: Measurement, drive: str, *, late: bool = False) -> dict[str, Prior]:
     """Return contact time and zeros as the record shows them without a law, SI.
 
     The first rise of the stress shows the contact; the motion at that time is its zero, unless the
-    zero of the file is as likely.
+    zero of the file is as likely. A motion that may be `late` shows neither.
     """
     out = {name: one for name, one in priors_of(measurement, drive).items() if name in ZEROS}
-    if measurement.rise is None:
+    if measurement.rise is None or (late and measurement.contact == "motion"):
         return out
     contact, error = measurement.rise
-    if "displacement_zero" not in out and measurement.displacement is not None:
+    if "displacement_zero" not in out and measurement.displacement is not None and not late:
         zero, speed, noise = _motion_at(measurement, contact)
         spread = math.hypot(speed * error, noise)
         of_file = -measurement.origins.get("displacement_zero", 0.0)
@@ -144,14 +144,14 @@ def _motion_at(measurement: Measurement, contact: float) -> tuple[float, float, 
 
 
 def limits_of(
-    name: str, measurement: Measurement, drive: str, duration: float
+    name: str, measurement: Measurement, drive: str, duration: float, *, late: bool
 ) -> tuple[float, float]:
     """Return the limits of a nuisance parameter, SI.
 
     They follow from what the record shows (`shown_by`); a measured strain stays below one.
     """
     prior, middle = priors_of(measurement, drive).get(name), values_of(measurement)[name]
-    rise = None if prior is not None else shown_by(measurement, drive).get(name)
+    rise = None if prior is not None else shown_by(measurement, drive, late=late).get(name)
     if name == FORCE_SCALE and not _shows_force(measurement):
         return middle, middle
     if prior is not None:

@@ -182,7 +182,7 @@ def _add_nuisance(
     free = nuisance.open_in(measurement, drive, counted) | {nuisance.TIME_SHIFT}
     usual = nuisance.values_of(measurement)
     for name in nuisance.names_of(drive, time_shift=late):
-        low, high = nuisance.limits_of(name, measurement, drive, scales.duration)
+        low, high = nuisance.limits_of(name, measurement, drive, scales.duration, late=late)
         origin = measurement.origins.get(name, 0.0)
         limits = {"min": low + origin, "max": high + origin} if low < high else {}
         vary = name in free and low < high

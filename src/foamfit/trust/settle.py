@@ -46,7 +46,8 @@ def held_by_record(problem: Problem, asked: Collection[str]) -> Problem:
 
     Those that the user has `asked` to vary stay free.
     """
-    shown = shown_by(problem.measurement, problem.objective.drive)
+    objective = problem.objective
+    shown = shown_by(problem.measurement, objective.drive, late=objective.time_shift)
     return problem.keeping({name: one for name, one in shown.items() if name not in asked})
 
 
