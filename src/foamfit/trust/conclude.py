@@ -17,6 +17,7 @@ from foamfit.data.measurement import INTEGRATED, interior_channel
 from foamfit.errors import SimulationError
 from foamfit.fitting.branches import visited
 from foamfit.fitting.curves import MOTION_CURVES
+from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.objective import MODEL_ERROR, Effort
 from foamfit.fitting.search import SearchRecord
 from foamfit.parts import ParameterEstimate
@@ -27,7 +28,7 @@ from foamfit.springs.parameters import any_param, split_name, unit_of
 from foamfit.text import engineering, listed
 from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
-from foamfit.trust.budget import make_budget
+from foamfit.trust.budget import changed, make_budget
 from foamfit.trust.checklist import POOR, make_checklist, may_vanish, status_of, warnings_of
 from foamfit.trust.contested import Settled, judged, settle, unsettled
 from foamfit.trust.covariance import Ends
@@ -53,7 +54,9 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         }
         insight = look(best, noise)
         correlation = _correlation(best)
-    balance, misfit = audit(measurement), objective.misfit(simulated)
+    late = best.value(TIME_SHIFT) if objective.time_shift else 0.0
+    on_time = changed(measurement, TIME_SHIFT, late) if late else measurement
+    balance, misfit = audit(on_time), objective.misfit(simulated)
     contradictions = unsettled(best, balance.contradictions)
     settled = settle(best, contradictions)
     estimates, budget = make_budget(best, _estimates(best, insight, intervals, settled))
