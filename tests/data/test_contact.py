@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+import foamfit as ff
 import rig
 from conftest import write_csv
 from foamfit.data.csv_file import read_test
@@ -18,6 +19,7 @@ from foamfit.data.prepare import condition
 from foamfit.data.zeros import tail_level
 from foamfit.errors import InputError
 from foamfit.fitting.problem import make_params
+from foamfit.springs.published import published
 
 HEIGHT, AREA, MASS, VELOCITY = 10e-3, 1e-4, 0.5, 2.0
 DURATION = 4e-3
@@ -169,6 +171,20 @@ def test_a_soft_end_of_contact_is_not_the_offset_of_the_sensor(soft):
         return
     assert len(taken) >= 57
     assert np.abs([level.value - 0.015 for level in taken]).max() < 4.0 * sigma / np.sqrt(20)
+
+
+def test_a_crest_at_the_end_of_contact_is_not_the_offset_of_the_sensor():
+    """The record ends with the contact, while the mass inside foam-2 vibrates."""
+    foam, rng = published["foam-2"], np.random.default_rng(4)
+    given = foam.chain
+    chain = ff.Chain(given.springs, given.heights, given.area, given.masses)
+    hit = ff.Impact(foam.striker_mass, foam.striker_velocity)
+    end = ff.simulate(chain, hit, np.linspace(0.0, 3e-3, 6001)).contact_end
+    clean = np.append(ff.simulate(chain, hit, np.linspace(0.0, end, 1500)).base_stress, np.zeros(3))
+    sigma = 0.002 * clean.max()
+    known = NoiseLevel(sigma, False, "known")
+    found = [tail_level(clean + sigma * rng.standard_normal(1503), known) for _ in range(20)]
+    assert not [level for level in found if level is not None and level.value > 4.0 * level.error]
 
 
 def test_a_rest_that_drifts_owns_up_to_it():

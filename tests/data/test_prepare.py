@@ -161,6 +161,14 @@ def test_a_mass_inside_goes_through_the_same_steps(before, n, noise):
     assert any("displacement_1 at contact, 3 mm, is taken off" in n for n in conditioned.notes)
 
 
+def test_a_mass_inside_that_starts_slowly_keeps_the_zero_of_the_file():
+    record = followed(impact(before=0.0), zero=0.0)
+    slow = record.interior[1] * (record.interior[1] / record.interior[1].max()) ** 0.3
+    conditioned = run(replace(record, interior={1: slow}))
+    assert "displacement_1" not in " ".join(conditioned.notes)
+    assert conditioned.interior[1].max() == pytest.approx(slow.max(), rel=1e-6)
+
+
 def test_a_mass_inside_that_overtakes_the_top_is_noted():
     notes = run(followed(impact(), share=1.2, zero=0.0)).notes
     assert any(note.startswith("Check: displacement_1 goes farther") for note in notes)

@@ -70,17 +70,18 @@ def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
 def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
     """Return the level of a force at the end of an impact, if flat, as after the rebound.
 
-    The end is extended backwards as long as the preceding rows agree with its level within one
-    standard error, a strict limit because a soft end of contact stays below the noise for long. The
-    correlation of few rows is unknown, so their mean gets the standard error of one row.
+    A crest of a vibration is not flat. The end is extended backwards as long as the preceding rows
+    agree with its level within one standard error, a strict limit because a soft end of contact
+    stays below the noise for long. The correlation of few rows is unknown, so their mean gets the
+    standard error of one row.
     """
     size = max(8, int(_TAIL * len(values)))
     step, n = max(4, size // 2), size
     if np.argmax(values) > len(values) - 2 * size:
         return None
-    level = mean_level(values[-n:], noise)
-    slope = level_on_line(np.arange(n, dtype=np.float64), values[-n:], 0.0, noise)[1]
-    if abs(slope.value) > _FLAT * slope.error:
+    level, rows = mean_level(values[-n:], noise), np.arange(n, dtype=np.float64)
+    slope = level_on_line(rows, values[-n:], 0.0, noise)[1]
+    if abs(slope.value) > _FLAT * slope.error or _is_bent(rows, values[-n:], noise):
         return None
     while n + step < len(values) // 2:
         more = mean_level(values[-n - step : -n], noise)
@@ -93,6 +94,13 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
     if level.samples < MIN_REST:
         level = level._replace(error=max(level.error, noise.sigma))
     return level if abs(level.value) < _HIGHEST * float(np.ptp(values)) else None
+
+
+def _is_bent(rows: Array, values: Array, noise: NoiseLevel) -> bool:
+    """Return whether samples follow a parabola and not a line."""
+    (bend, *_), variance = np.polyfit(rows, values, 2, cov="unscaled")
+    sigma = noise.sigma * float(np.sqrt(noise.time))
+    return bool(abs(bend) > _FLAT * sigma * float(np.sqrt(variance[0, 0])))
 
 
 def take_zeros(
@@ -207,7 +215,7 @@ def _zero_of_motion(
     source = zero.source(noise, "line through") + (" around it" if flies else " from there on")
     size, stress = float(np.ptp(values)), record.stress
     loaded = not impact and stress[:3].mean() > 0.05 * stress.max() and 0.0 < zero.value < size
-    least = max(ELSEWHERE * zero.error, ((0.1 if impact else 0.02) if top else 2e-3) * size)
+    least = max(ELSEWHERE * zero.error, (0.1 if impact else 0.02) * size)
     keep = not flies and (loaded or abs(zero.value) <= least)
     return NOTHING if keep else zero, source
 

@@ -14,7 +14,13 @@ from foamfit.data.cycles import cycles_of, loading_rate
 from foamfit.data.measurement import Measurement
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError, check_whole
-from foamfit.fitting.curves import check_drive, check_time_shift, choose_drive, driving_motion
+from foamfit.fitting.curves import (
+    EXACT,
+    check_drive,
+    check_time_shift,
+    choose_drive,
+    driving_motion,
+)
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.scenes import channel_of
 from foamfit.fitting.search import Tracker, descend
@@ -198,6 +204,9 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
     objective, same = problem.objective, source.sha256 == measurement.data_sha256
     if not same or source.smoothed is None or chosen != "displacement":
         return problem
+    level, moved = objective.measurement.noise.of("displacement"), measurement.displacement
+    if level is None or moved is None or level.sigma <= EXACT * float(np.ptp(moved)):
+        return problem  # nothing is smoothed, but turns between samples are found
     # The fitted record, possibly with other cycles: smooth the motion only if the fit did.
     motion = driving_motion(objective.measurement, objective.time, always=source.smoothed)
     followed = (motion if source.smoothed else None,)
