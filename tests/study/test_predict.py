@@ -97,6 +97,19 @@ def test_the_band_holds_held_out_noise(fitted):
     assert 0.93 < np.mean(shares) < 0.97
 
 
+def test_the_fitted_record_is_driven_through_turns_between_its_samples(tmp_path):
+    """As another record is, if its motion has no noise."""
+    noise = {"stress_strain": {"motion_smoothed": False}}
+    path = written(tmp_path, fit_content(noise=noise, data_sha256="0" * 64))
+    test = replace(loop(), noise=Noise(SIGMA, 1e-12))
+    test = replace(
+        test, **{name: getattr(test, name)[1::2] for name in ("time", "stress", "displacement")}
+    )
+    other = replace(test, data_sha256="1" * 64)
+    first, second = (ff.predict(path, one).curves["stress_strain"] for one in (test, other))
+    assert np.array_equal(first.predicted, second.predicted)
+
+
 def test_the_band_of_the_parameters_is_that_of_linearised_errors(fitted):
     found = ff.predict(fitted, loop(seed=1), draws=400)
     problem = make_problem(loop(), "microscale", None, None, None, interior_mass=False)
