@@ -19,6 +19,7 @@ ASKED = "Check:"  # starts a note about a probable error in the input
 
 # Sources of a displacement; an integrated one is not an independent measurement.
 MEASURED, INTEGRATED = "measured", "integrated from force"
+FROM_VELOCITY = "integrated from velocity"
 # SI units of the channels other than displacements, which are in m.
 UNITS = {"stress": "Pa", "velocity": "m/s", "acceleration": "m/s²"}
 
@@ -373,6 +374,11 @@ class Measurement(Samples):
         """Rows of the file, used and dropped; without a file all samples are used."""
         n = max((values.size for values in self.channels().values()), default=0)
         return self.count or RowCount(n, n)
+
+    @property
+    def is_velocity(self) -> bool:
+        """Whether a velocity alone was recorded, which was integrated and differentiated."""
+        return self.motion == FROM_VELOCITY and "stress" in self.derived
 
     def channels(self) -> dict[str, Array]:
         """Return the available ones of stress, displacement, acceleration, interior motions."""

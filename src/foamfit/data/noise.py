@@ -113,6 +113,16 @@ def estimated_noise(values: Array, what: str = "samples") -> NoiseLevel:
     return NoiseLevel(sigma, False, how, correlation_time(phi))
 
 
+def noise_of_integral(values: Array, step: float) -> NoiseLevel:
+    """Return the noise of the integral of a signal sampled every `step`: that of a random walk.
+
+    It is the RMS over the record; such noise is correlated over all of it.
+    """
+    level, n = estimated_noise(values), values.size
+    sigma = level.sigma * step * float(np.sqrt(0.5 * n * level.time))
+    return NoiseLevel(sigma, False, f"of an integral, {level.how}", float(n))
+
+
 def noise_before_contact(
     whole: dict[str, Array], n: int, curves: dict[str, Array], block: int
 ) -> dict[str, NoiseLevel]:

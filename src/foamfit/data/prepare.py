@@ -15,6 +15,7 @@ from foamfit.data import contact, cycles, frames, zeros
 from foamfit.data import outliers as repair
 from foamfit.data.contact import Rise, rise_of
 from foamfit.data.measurement import (
+    FROM_VELOCITY,
     MEASURED,
     MIN_ROWS,
     Dropped,
@@ -34,6 +35,7 @@ from foamfit.data.noise import (
     integrated_twice,
     noise_before_contact,
     noise_level,
+    noise_of_integral,
     smooth,
 )
 from foamfit.errors import InputError
@@ -117,6 +119,11 @@ def condition(
     block = -(-len(whole) // len(record))
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
+    if whole.motion == FROM_VELOCITY and "stress" in whole.derived:
+        assert whole.time is not None
+        assert whole.velocity is not None
+        step = float(np.median(np.diff(whole.time)))
+        noise["displacement"] = noise_of_integral(whole.velocity, step)
     contact_time = whole.origins.get("contact_time", 0.0)
     return _measured(
         whole,
