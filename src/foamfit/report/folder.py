@@ -205,6 +205,11 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     """
     path = Path(folder)
     if path.is_dir():
+        for name, what in (("joint.json", "tests"), ("cycles.json", "cycles")):
+            if (path / name).is_file():
+                inside = sorted(str(one.parent) for one in path.glob("*/fit.json"))
+                example = f", like {inside[0]}" if inside else ""
+                raise InputError(f"{path} contains fits of several {what}; name one{example}")
         path = path / "fit.json"
     try:
         content = json.loads(read_whole(path))

@@ -114,14 +114,9 @@ def read_source(result: HasContent | str | Path) -> Source:
 
 
 def _file(path: Path) -> Path:
-    """Return the file of a result; in a folder joint.json, or else fit.json."""
-    if not path.is_dir():
-        return path
-    if (path / "joint.json").is_file():
-        return path / "joint.json"
-    if not (path / "fit.json").is_file() and (path / "cycles.json").is_file():
-        raise InputError(f"{path} contains fits of several cycles; name one, like {path}/cycle-1")
-    return path / "fit.json"
+    """Return the file of a joint fit, or else the path of a fit or its folder."""
+    joint = path / "joint.json"
+    return joint if joint.is_file() else path
 
 
 def _source(content: Mapping[str, Any], where: str) -> Source:

@@ -133,13 +133,16 @@ def plan(
         risk = np.any([each.broken for each in more], axis=0)
         error = None if target is None else target.error(known, more)
         found = expected(known, more)
+        # A further test takes nothing away, though the draws may lie where less is determined.
+        kept = {n for n, x in found.items() if now[n].state == "determined" != x.state}
+        found |= {name: now[name] for name in kept}
         if contradicted and one.drive == "impact":  # as in a fit, where the law errs as well
             found = {name: x.capped() for name, x in found.items()}
         return Outcome(one, float(np.mean(risk)), found, more[0].force, error, more[0].apart)
 
+    now = _now(known, tests)
     outcomes = [outcome(one, what) for one, what in zip(asked, seen, strict=True)]
     safe = [i for i, one in enumerate(outcomes) if one.breaks <= RISKY]
-    now = _now(known, tests)
     best = _advised(outcomes, safe, sum(one.probability for one in now.values())) if safe else None
     pair = _pair(known, outcomes, seen, safe)
     progress(0.92, "what no test of this rig determines")

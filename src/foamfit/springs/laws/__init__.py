@@ -102,7 +102,7 @@ def register(law: Law) -> Law:
             return LawSpring(known, values, relaxation)
 
         known = replace(law, spring=make)
-    check(known, PAPER)  # its functions stay compiled for the springs that `make` makes
+    check(known, (*PAPER, "auto"))  # its functions stay compiled for the springs that `make` makes
     _LAWS[known.kind] = known
     return known
 
@@ -170,7 +170,7 @@ def _run(path: str, folder: str, text: str) -> tuple[Law, ...]:
     try:
         exec(compile(text, path, "exec"), module.__dict__)
         given = [one for one in vars(module).values() if isinstance(one, Law)]
-        kinds_of = {one.kind: one for one in given if one.kind not in PAPER}
+        kinds_of = {one.kind: one for one in given if before.get(one.kind) is not one}
         found = tuple(register(one) for one in kinds_of.values())
     except (Exception, SystemExit) as error:
         _LAWS.clear()
