@@ -12,6 +12,7 @@ always draws the same springs, striker and noise of a channel, whatever else is 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -26,7 +27,10 @@ from truth import Array, Bistable, Course, Law, Microscale, Motion, Rig, Terms
 GRAVITY = 9.80665
 DURATION = 4.0  # s, of a slow motion
 MOST_STRAIN = 0.93
-UNITS = {"force": ("N", 1.0), "displacement": ("mm", 1e3), "acceleration": ("m/s^2", 1.0)}
+UNITS = {
+    "force": ("N", 1.0), "displacement": ("mm", 1e3), "acceleration": ("m/s^2", 1.0),
+    "velocity": ("m/s", 1.0),
+}  # fmt: skip
 # Height (m), cross-section (m²) and striker (kg): the paper's rig, and a drop tower.
 BENCH, TOWER = (1.2e-3, 1.9635e-5, 7e-3), (20e-3, 1e-3, 5.0)
 SLOW_HEIGHT, SLOW_AREA = 10e-3, 0.25 * math.pi * 7.6e-3**2
@@ -43,7 +47,9 @@ class Impact:
     `trimmed` record starts at contact, at time zero, with correct zeros. A `gauge` on the specimen
     rests until contact. `gravity` acts on the striker before, during and after contact; if `said`,
     the TOML states it. `velocity_sd` is the relative standard deviation of the velocity in the
-    TOML, which has a random error of this size.
+    TOML, which has a random error of this size. With `delay_sd` the motion is in a file of its own,
+    and late by a random delay with this standard deviation, in durations of the contact, which the
+    TOML gives.
     """
 
     law: str = "bistable"
@@ -59,6 +65,7 @@ class Impact:
     gauge: bool = False
     gravity: bool = False
     velocity_sd: float = 0.0
+    delay_sd: float = 0.0
     said: bool = True
 
 
@@ -104,6 +111,7 @@ class Record:
     rig: Rig
     course: Course
     toml_velocity: str = ""
+    delay_sd: float = 0.0  # s
 
     @property
     def model(self) -> str:
@@ -246,11 +254,15 @@ def recorded(
         first, late, origin = 0, 0.0, 0.0
     origin = round(origin / step) * step
     own = (np.arange(first + math.ceil((1.0 + after) * samples)) - first + late) * step
-    motion, stress = course.top(own, setup.gauge), course.stress(own)
+    spread = float(f"{setup.delay_sd * lasts:.3g}")
+    delay = spread * np.random.default_rng([seed, 4]).standard_normal()
+    motion, stress = course.top(own - delay, setup.gauge), course.stress(own)
+    sides = [course.top(own + side * 1e-3 * step, setup.gauge) for side in (-1.0, 1.0)]
     everything = {
         "force": stress * rig.area,
         "displacement": motion,
         "acceleration": stress * rig.area / rig.mass,  # an accelerometer falling freely reads zero
+        "velocity": (sides[1] - sides[0]) / (2e-3 * step),
     }
     inside = (own >= 0.0) & (own <= lasts)
     clean = {name: everything[name] for name in setup.channels}
@@ -267,12 +279,14 @@ def recorded(
     said = f"{rig.velocity * (1.0 + sd * off):.12g}" + (f" ± {sd * rig.velocity:.3g}" if sd else "")
     truth = parameters(rig.springs) | {
         "contact_time": origin + (first - late) * step,
-        "displacement_zero": zero,
         "velocity": rig.velocity,
         "striker_mass": rig.mass,
+        "time_shift": delay,
     }
+    if "displacement" in clean:
+        truth["displacement_zero"] = zero
     time = origin + np.arange(len(own)) * step
-    return Record(setup, time, channels, sizes, truth, rig, course, f"{said} m/s")
+    return Record(setup, time, channels, sizes, truth, rig, course, f"{said} m/s", spread)
 
 
 def slow_motion(setup: Slow, peak: float, rng: np.random.Generator) -> Motion:
@@ -343,24 +357,34 @@ def slow(setup: Slow, seed: int) -> Record:
     return Record(setup, own, channels, sizes, truth, rig, course)
 
 
+def write_table(path: Path, record: Record, channels: Sequence[str]) -> None:
+    """Write the time and some channels of a record as CSV."""
+    unit, factor = ("ms", 1e3) if isinstance(record.setup, Impact) else ("s", 1.0)
+    columns = [[f"{t * factor:.12g}" for t in record.time]]
+    header = [f"time ({unit})"]
+    for channel in channels:
+        unit, factor = UNITS[channel]
+        header.append(f"{channel} ({unit})")
+        columns.append([f"{v * factor:.9g}" for v in record.channels[channel]])
+    rows = [",".join(row) for row in zip(*columns, strict=True)]
+    path.write_text("\n".join([",".join(header), *rows]) + "\n", encoding="utf-8")
+
+
 def write(record: Record, folder: Path, name: str = "test") -> Path:
     """Write a record as CSV and TOML; return the path of the CSV."""
     path, rig, setup = folder / f"{name}.csv", record.rig, record.setup
-    unit, factor = ("ms", 1e3) if isinstance(setup, Impact) else ("s", 1.0)
-    columns = [[f"{t * factor:.12g}" for t in record.time]]
-    header = [f"time ({unit})"]
-    for channel, values in record.channels.items():
-        unit, factor = UNITS[channel]
-        header.append(f"{channel} ({unit})")
-        columns.append([f"{v * factor:.9g}" for v in values])
-    rows = [",".join(row) for row in zip(*columns, strict=True)]
-    path.write_text("\n".join([",".join(header), *rows]) + "\n", encoding="utf-8")
+    apart = ("displacement",) if record.delay_sd else ()
+    write_table(path, record, [one for one in record.channels if one not in apart])
     lines = ["[specimen]", f'height = "{rig.height} m"', f'area = "{rig.area} m^2"']
     if len(rig.heights) > 1:
         lines.append("heights = [" + ", ".join(f'"{h} m"' for h in rig.heights) + "]")
     if isinstance(setup, Impact):
         lines += ["[striker]", f'mass = "{rig.mass} kg"', f'velocity = "{record.toml_velocity}"']
         lines += ["gravity = true"] * (setup.gravity and setup.said)
+        if apart:
+            write_table(folder / f"{name}-motion.csv", record, apart)
+            delay = f'delay = "0 ± {1e6 * record.delay_sd:.6g} us"'
+            lines += ["[motion]", f'file = "{name}-motion.csv"', delay]
     elif setup.noise_given:
         lines += ["[noise]", f'stress = "{record.noise["force"] / rig.area} Pa"',
                   f'displacement = "{record.noise["displacement"]} m"']  # fmt: skip

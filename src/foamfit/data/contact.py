@@ -187,19 +187,21 @@ def start_of_impact(record: Record, levels: Levels, *, late: bool = False) -> St
         leaves = partial(leave_rest, time, stress, levels["stress"], _STILL_IMPACT)
         at = leaves(drift * float(np.ptp(stress))) or (leaves() if elsewhere else None)
     start = _at_kink("stress", time, at, "stress") if at else _first_sample(record, levels)
-    if w is None or (late and start.free):
+    flies = elsewhere if w is not None else record.velocity is not None
+    if late and start.free:
         return start
-    if at := motion_leaves_rest(record, levels):
+    if w is not None and (at := motion_leaves_rest(record, levels)):
         up = slice(int(np.argmax(w)) + 1)
         # A motion that starts far from the onset of the stress is not due to contact.
         alike = abs(at[0] - start.time) < 0.1 * (time[up][-1] - start.time)
         if not start.free or (at[1] < start.error and alike):
             start = _at_kink("displacement", time, at, "motion")
-    elif "stress" in record.derived and elsewhere:  # the motion was recorded in flight
+    elif "stress" in record.derived and flies:  # the motion was recorded in flight
         below = np.flatnonzero(stress[: int(np.argmax(stress))] < _BRAKED * stress.max())
         last = int(below[-1]) if below.size else 0
         at = float(time[last]), _BRAKED * float(np.ptp(time))
-        start = _at_kink("displacement", time, at, "motion", "line") if last else start
+        channel = "displacement" if w is not None else "velocity"
+        start = _at_kink(channel, time, at, "motion", "line") if last else start
     return start
 
 
