@@ -40,6 +40,7 @@ from foamfit.options import DRAWS, FREED, STARTS, STARTS_IN_SERIES, Given, Watch
 from foamfit.results import Fit, Intervals
 from foamfit.solve.cache import SPENT
 from foamfit.springs.model import Model, with_options
+from foamfit.text import listed
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
@@ -249,6 +250,8 @@ def identify(
             problem.objective.simulate(problem.vector())
         except SimulationError as error:
             why = str(error)
+        if options.fix:
+            why += f" with {listed(f'{name} = {one:g}' for name, one in options.fix.items())}"
         raise SimulationError(
             f"{measurement.name}: none of the {tried} sets of parameters that were tried could be "
             f"simulated; {why}"
