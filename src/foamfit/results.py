@@ -116,6 +116,7 @@ class Intervals:
     elsewhere: dict[str, float] = field(default_factory=dict)
     # Ends of the ranges that include model error, where there is one
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+    ranged: bool = True  # False if the fit was stopped before it computed ranges that it needs
     # Samples of a Markov chain, (walkers, steps) by parameter, SI; kept in `Fit.draws`
     draws: dict[str, Array] = field(default_factory=dict)
 

@@ -190,7 +190,7 @@ def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path):
     asked = ["--cycle", "3,2", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "2"]
     desk.fit(asked)
     assert desk.ending() == ""
-    assert desk.command == f"foamfit fit synthetic.csv {' '.join(asked)}"
+    assert desk.command == f"foamfit fit synthetic.csv --specimen test.toml {' '.join(asked)}"
     assert "2 of 3 cycles fitted" in desk.worker.told
     told = run("fit", str(record), *asked, "--json", f"--out={tmp_path}/r")
     command = json.loads(told.stdout)["cycles"]

@@ -301,7 +301,11 @@ class Problem:
             first, last = self.index["s1_height"], self.index[f"s{len(self.model.kinds)}_height"]
             height = self.measurement.specimen.height
             return partial(_put_rest, height, slice(first, last), last)  # faster than lmfit
-        return partial(self._evaluated, self.params.copy(), [*expressions]) if expressions else None
+        params = self.params.copy()
+        for one in params.values():  # a step beyond a limit must not be cut there
+            if one.expr is None:
+                one.set(min=-math.inf, max=math.inf)
+        return partial(self._evaluated, params, [*expressions]) if expressions else None
 
     def _evaluated(self, params: lmfit.Parameters, tied: list[str], values: Array) -> Array:
         """Set the `tied` parameters by lmfit, whose `params` are overwritten."""

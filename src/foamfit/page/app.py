@@ -24,6 +24,7 @@ from foamfit.page.desk import (
     BUSY,
     LARGEST,
     QUANTITIES,
+    SAVED_TOML,
     Desk,
     Preview,
     preview,
@@ -134,7 +135,7 @@ class Window:
         saves: dict[tuple[str, str], Callable[[], bytes]] = {
             ("the result folder", "result.zip"): lambda: self.desk.zipped(),
             ("the report", "report.html"): lambda: self._report().encode(),
-            ("the TOML", "test.toml"): lambda: self.desk.toml,
+            ("the TOML", SAVED_TOML): lambda: self.desk.toml,
             ("the LS-DYNA card", "card.zip"): lambda: self.desk.card(cycle()),
             ("the test plan", "plan.html"): lambda: self.desk.planned(cycle()),
         }

@@ -38,6 +38,7 @@ from foamfit.text import listed
 LARGEST = 64 * 1024 * 1024  # bytes of the largest file that can be dropped
 LONGEST = 80  # characters of the longest file name
 TOGETHER = 5.0  # s within which a table and its TOML arrive if they are dropped together
+SAVED_TOML = "test.toml"  # name of the TOML that the page saves
 BUSY = "A fit is running; stop it before you change the test."
 TABLES = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
 # Label and example of each quantity to fill in, by its name in messages. The first `FIRST` are
@@ -223,15 +224,16 @@ class Desk:
 
     @property
     def command(self) -> str:
-        """The command that repeats the last fit in a terminal, with the TOML next to the file."""
+        """The command that repeats the last fit in a terminal, with the saved TOML."""
         assert self.csv is not None
         assert self.worker is not None
-        return shlex.join(["foamfit", "fit", self.csv.name, *self.worker.job.arguments])
+        files = self.csv.name, "--specimen", SAVED_TOML
+        return shlex.join(["foamfit", "fit", *files, *self.worker.job.arguments])
 
     def zipped(self) -> bytes:
         """Return the result folder as a ZIP, with the TOML of the test."""
         assert self.result is not None
-        return _zip(self.result, {"test.toml": self.result.with_suffix(".toml")})
+        return _zip(self.result, {SAVED_TOML: self.result.with_suffix(".toml")})
 
     def card(self, cycle: int) -> bytes:
         """Return an LS-DYNA card of the fit of a cycle (0: a single fit) as a ZIP."""

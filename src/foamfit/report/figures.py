@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -11,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from foamfit.errors import InputError
 from foamfit.files import write_file
-from foamfit.text import wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,13 +103,25 @@ def drawing(width: float, height: float, *title: str) -> Iterator[Figure]:
     import matplotlib
     from matplotlib.figure import Figure
 
-    lines = [line for part in title for line in wrapped(part, 0, int(16 * width))]
+    lines = _fitting(title, width)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(width, height + LINE * len(lines)), layout="constrained")
         if lines:  # a dollar sign in a name does not start a formula
             style: Any = {"fontsize": 8, "parse_math": False}
             figure.suptitle("\n".join(lines), x=0.01, ha="left", **style)
         yield figure
+
+
+def _fitting(title: Sequence[str], width: float) -> list[str]:
+    """Return a title in lines that fit into a width (inches) at 8 pt."""
+    from matplotlib.textpath import TextPath
+
+    for per_inch in (16, 14, 12, 10, 8):
+        lines = [line for part in title for line in textwrap.wrap(part, int(per_inch * width))]
+        paths = (TextPath((0.0, 0.0), line.replace("$", "S"), size=8) for line in lines)
+        if max((path.get_extents().x1 for path in paths), default=0.0) <= 0.97 * 72.0 * width:
+            break
+    return lines
 
 
 @contextmanager
@@ -181,7 +193,8 @@ def _file(figure: Figure, form: Format, dpi: int) -> bytes:
 def limits(values: Sequence[float], ends: Sequence[float]) -> tuple[float, float]:
     """Return limits of an axis; very wide intervals are cut, so that values stay apart."""
     low, high = min(values), max(values)
-    room = max(1.5 * (high - low), 0.1 * max(abs(low), abs(high)), 1e-12)
+    room = max(1.5 * (high - low), 0.1 * max(abs(low), abs(high)))
+    room = room or max(map(abs, ends), default=0.0) or 1.0  # all are zero
     bottom, top = max(min([low, *ends]), low - room), min(max([high, *ends]), high + room)
     edge = 0.08 * max(top - bottom, room)
     return bottom - edge, top + 2.0 * edge

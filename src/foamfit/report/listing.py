@@ -149,13 +149,20 @@ def _listed(path: Path) -> Row:
             runtime_s=content.get("runtime_s"),
             parameters={name: build(ParameterEstimate, p, {}) for name, p in made.items()},
             model=law_in_words(model.name, content.get("relaxation", 0)),
-            options=", ".join(k if v is True else f"{k} {v}" for k, v in rest.items()),
+            options=", ".join(k if v is True else f"{k} {_shown(v)}" for k, v in rest.items()),
             place=place,
             when=when,
         )
     except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
         why = str(error) if isinstance(error, InputError) else f"{path.name} is damaged"
         return Row(place.name, status="failed", error=why, place=place, when=when)
+
+
+def _shown(value: Any) -> str:
+    """Return the value of an option as on the command line."""
+    if isinstance(value, dict):
+        return " ".join(f"{name}={one}" for name, one in value.items())
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def _largest(tests: dict[str, Any]) -> dict[str, float]:

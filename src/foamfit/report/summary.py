@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,7 @@ from foamfit.report.tables import count_determined
 from foamfit.results import STATED, Fit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, counted, percent, wrapped
-from foamfit.trust.covariance import RULE
+from foamfit.trust.covariance import RULE, WEAK
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -158,7 +157,8 @@ def conclusions(result: Fit) -> tuple[str, ...]:
         for name, p in springs.items()
         if p.state == "determined" and p.ci95 is not None and p.value
     }
-    widths = sorted((half, name) for name, half in halves.items() if math.isfinite(half))
+    # Wider ones are determined by a scale that is not their value.
+    widths = sorted((half, name) for name, half in halves.items() if half <= WEAK)
     found, varied = count_determined(result.parameters)
     return sentences(
         "conclusions",

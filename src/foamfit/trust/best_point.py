@@ -128,9 +128,10 @@ class BestPoint:
 
     def to_judge(self, taken: Array | None = None) -> tuple[Any, ...]:
         """Return the arguments of `curve_errors`; `taken` is the noise absorbed by a joint fit."""
-        objective, test = self.problem.objective, self.problem.measurement
+        objective = self.problem.objective
         # Noise of a driving stress, or of a velocity before its integration, has slow waves.
-        slow = objective.drive == "stress" or test.is_velocity
+        slow = objective.drive == "stress"
+        slow = slow or (objective.drive == "impact" and self.problem.measurement.is_velocity)
         return self.residual, self.scaled, objective.sizes, taken, slow
 
     @property

@@ -85,7 +85,7 @@ def make_checklist(
     checks = (
         *_of_search(best, record),
         _followed(best, misfit),
-        _at_noise(best),
+        _at_noise(best, intervals),
         _of_record(best, estimates, record),
         _determined(best, estimates),
         _visited(best, estimates),
@@ -131,7 +131,7 @@ def _followed(best: BestPoint, misfit: Mapping[str, float | None]) -> Check:
     return _check("followed", fine, fatal=fatal, curves=curves)
 
 
-def _at_noise(best: BestPoint) -> Check:
+def _at_noise(best: BestPoint, intervals: Intervals) -> Check:
     """Check by size, correlation and model error whether residuals are noise (`Fit.at_noise`)."""
     objective, has_noise, longest = best.problem.objective, False, 1.0
     errors = best.errors if best.names else (None,) * len(objective.counted)
@@ -152,7 +152,8 @@ def _at_noise(best: BestPoint) -> Check:
     answer = False if missed or long or large else None
     if answer is None and has_noise and (seen or longest >= 1.05):
         answer = True
-    return _check("noise", answer, seen=seen, missed=missed, tau=longest, long=long)
+    facts: dict[str, Any] = {"seen": seen, "missed": missed, "tau": longest, "long": long}
+    return _check("noise", answer, ranged=intervals.ranged, **facts)
 
 
 def _of_record(best: BestPoint, estimates: Estimates, record: SearchRecord) -> Check:

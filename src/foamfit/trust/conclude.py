@@ -54,6 +54,9 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         }
         insight = look(best, noise)
         correlation = _correlation(best)
+    if record.stopped is not None and best.names and best.misfits:
+        warnings = (*intervals.warnings, say("interval", "stopped"))
+        intervals = replace(intervals, ranged=False, warnings=warnings)
     late = best.value(TIME_SHIFT) if objective.time_shift else 0.0
     on_time = changed(measurement, TIME_SHIFT, late) if late else measurement
     balance, misfit = audit(on_time), objective.misfit(simulated)
@@ -302,15 +305,18 @@ def _varied(
     objective, other = problem.objective, intervals.elsewhere.get(name)
     zero = problem.measurement.origins.get(name, 0.0)  # in the numbers of the file
     misfit, curve = max((objective.off(best.simulated, n) or 0.0, n) for n in objective.counted)
-    if state == "determined" and (objective.interior_mass or other is not None or misfit > POOR):
+    doubt = not intervals.ranged or objective.interior_mass or other is not None or misfit > POOR
+    if state == "determined" and doubt:
         there = None if other is None else other + zero
         facts = {"vibrates": objective.interior_mass, "there": there, "off": misfit, "curve": curve}
+        facts |= {"ranged": intervals.ranged}
         state, why = "weak", say("why", "weak", why=why, unit=unit, **facts)
     state, why = judged(settled, best, name, (ends[0] + zero, ends[1] + zero), (state, why))
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
     astray = name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf)
-    doubtful, method = name in intervals.doubtful, "local covariance" if stalled else method
+    method = "local covariance" if stalled else method
+    doubtful = name in intervals.doubtful and method == "local covariance"
     why = say("why", "interval", why=why, doubtful=doubtful, stalled=stalled, astray=astray)
     ci95, stderr = (max(ends[0], low), min(ends[1], high)), float(best.spread.stderr[column])
     return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method, span)
