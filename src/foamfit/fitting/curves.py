@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
 
@@ -13,6 +14,7 @@ from foamfit.arrays import Array
 from foamfit.data.calibration import contradictions
 from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel, is_clipped
 from foamfit.data.motion import SmoothMotion, follow
+from foamfit.data.noise import smooth
 from foamfit.errors import InputError
 from foamfit.options import DRIVES
 from foamfit.solve.scene import Motion
@@ -27,6 +29,7 @@ MOTION_CURVES = ("displacement_time", "stress_strain")
 # A motion with less noise than this fraction of its range is exact. A smooth motion is used if its
 # residuals are at most this multiple of the noise.
 EXACT, FOLLOWED = 1e-6, 1.5
+TENSION = 0.005  # of the peak stress: the least that a specimen must bear to count as glued
 # Largest time between contact and the first sample, in sampling intervals, for which the simulation
 # starts at the contact.
 LATEST = 50.0
@@ -199,6 +202,20 @@ def driven_instants(measurement: Measurement, clock: Array, motion: SmoothMotion
         late = first / (second - first) if second > first else -1.0
         more += [at - late * (then - at)] if 0.0 < late < LATEST else []
     return np.union1d(clock, more) if more else clock
+
+
+def is_slack(measurement: Measurement) -> bool:
+    """Return whether the specimen can leave the platen: the record shows no tension after its peak.
+
+    Of several cycles fitted as one history it always can.
+    """
+    stress, level = measurement.stress, measurement.noise.of("stress")
+    if stress is None or measurement.last_cycle is not None:
+        return True
+    width = max(1, stress.size // 100)
+    lowest = float(smooth(stress, width)[int(np.argmax(stress)) :].min())
+    noise = 0.0 if level is None else 4.0 * level.sigma / math.sqrt(width)
+    return lowest >= -max(TENSION * float(stress.max()), noise)
 
 
 def without_tension(motion: Motion) -> Motion:

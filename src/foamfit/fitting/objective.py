@@ -28,6 +28,7 @@ from foamfit.fitting.curves import (
     check_time_shift,
     checked_weights,
     interior_curves,
+    is_slack,
 )
 from foamfit.fitting.scenes import NOWHERE, Places, Scenes, channel_of
 from foamfit.fitting.starts import thinned
@@ -99,6 +100,7 @@ class Objective:
     given: tuple[nuisances.Prior, ...] = ()  # Priors of spring parameters
     followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is already known
     averaged: float = np.inf  # longest time that a sample averages, s, if the samples are thinned
+    slack: bool | None = None  # see `is_slack`; None: as the record shows
     spent: Spent = field(default_factory=Spent)
     # Largest amplitude, in standard deviations, of the motion that would explain the residual
     unexplained: float | None = field(default=None, init=False)
@@ -115,9 +117,10 @@ class Objective:
         self._accelerated = self.drive == "impact" and test.acceleration is not None
         self.curves = (*CURVES, *((ACCELERATION,) if self._accelerated else ()), *self.interior)
         self.weights = checked_weights(self.weights, self.curves)
+        self.slack = is_slack(test) if self.slack is None else self.slack
         self.scenes = Scenes(
             test, self.model, self.drive, self.curves, self.interior, self.nuisance, self.rtol,
-            self.interior_mass, self.followed, self.averaged,
+            self.interior_mass, self.followed, self.averaged, self.slack,
         )  # fmt: skip
         self.time, self.usual = self.scenes.time, self.scenes.usual
         self.measured = self._measured()

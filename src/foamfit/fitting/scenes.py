@@ -88,6 +88,7 @@ class Scenes:
     interior_mass: bool
     followed: tuple[SmoothMotion | None, ...] = ()
     averaged: float = np.inf
+    slack: bool = True  # whether the specimen bears no tension under a given motion
     _asked: dict[tuple[bytes, bool], Wanted] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
@@ -277,7 +278,7 @@ class Scenes:
         inside = everything or any(name in self.interior for name in counted)
         plan, late = self._placed(self.plans[damped], at), at.get(nuisances.TIME_SHIFT, 0.0)
         motion = run(plan, inside)
-        if self.driven and self.measurement.last_cycle is not None:
+        if self.driven and self.slack:
             motion = without_tension(motion)
         shown = motion
         if late != 0.0 and self.drive == "impact":
