@@ -59,6 +59,13 @@ def responses(best: BestPoint) -> dict[str, Array]:
     }
 
 
+# Zero of a channel that scales with a quantity, and the power.
+_OF_ZEROS = {
+    "area": ("stress_zero", -1.0), "stress_scale": ("stress_zero", 1.0),
+    "striker_mass": ("stress_zero", 1.0), "displacement_scale": ("displacement_zero", 1.0),
+}  # fmt: skip
+
+
 def _value(test: Measurement, quantity: str) -> float:
     """Return the value of a quantity of the TOML, SI; 1 for a scale, whose ± is relative."""
     if quantity.startswith("height_"):
@@ -86,7 +93,21 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
     rounding = ROUNDING * np.max(np.abs(steps), initial=0.0)
     steps = np.where(np.abs(steps) > rounding, steps, 0.0) * best.sizes
     moves = problem.moves(best.values, best.names)
-    return np.asarray((0.5 * (high - low) + moves @ steps) * (share / step))
+    change = (0.5 * (high - low) + moves @ steps) * (share / step)
+    return np.asarray(change + _of_origin(best, quantity, share))
+
+
+def _of_origin(best: BestPoint, quantity: str, share: float) -> Array:
+    """Return the change of the zeros in the file, to which the fitted ones are added, (n_values,).
+
+    The zero of a channel scales with the channel.
+    """
+    problem, out = best.problem, np.zeros(best.values.size)
+    zero, power = _OF_ZEROS.get(quantity, ("", 0.0))
+    if zero in best.index and (quantity != "striker_mass" or problem.measurement.braked):
+        place = best.index[zero]
+        out[place] = power * share * problem.origins[place]
+    return out
 
 
 def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array]:
