@@ -204,14 +204,14 @@ def driven_instants(measurement: Measurement, clock: Array, motion: SmoothMotion
     return np.union1d(clock, more) if more else clock
 
 
-def is_slack(measurement: Measurement) -> bool:
+def is_slack(measurement: Measurement, model: Model) -> bool:
     """Return whether the specimen can leave the platen: the record shows no tension after its peak.
 
-    Of several cycles fitted as one history it always can.
+    Of several cycles fitted as one history it always can; without relaxation it has no reason to.
     """
     stress, level = measurement.stress, measurement.noise.of("stress")
-    if stress is None or measurement.last_cycle is not None:
-        return True
+    if stress is None or measurement.last_cycle is not None or not model.relaxation:
+        return measurement.last_cycle is not None
     width = max(1, stress.size // 100)
     lowest = float(smooth(stress, width)[int(np.argmax(stress)) :].min())
     noise = 0.0 if level is None else 4.0 * level.sigma / math.sqrt(width)

@@ -117,7 +117,7 @@ class Objective:
         self._accelerated = self.drive == "impact" and test.acceleration is not None
         self.curves = (*CURVES, *((ACCELERATION,) if self._accelerated else ()), *self.interior)
         self.weights = checked_weights(self.weights, self.curves)
-        self.slack = is_slack(test) if self.slack is None else self.slack
+        self.slack = is_slack(test, self.model) if self.slack is None else self.slack
         self.scenes = Scenes(
             test, self.model, self.drive, self.curves, self.interior, self.nuisance, self.rtol,
             self.interior_mass, self.followed, self.averaged, self.slack,
