@@ -158,13 +158,14 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
 
     The specimen is unloaded, or loaded least, at the lowest displacements between the cycles.
     Contact starts where a straight line through the early rise meets the level of the stress there,
-    and ends where the stress returns to that level. A negative level is an offset of the sensor, as
-    a foam does not pull its platen for long. The strain not recovered is `origins["start_strain"]`.
+    and ends where the stress returns to that level. A level clearly below zero is an offset of the
+    sensor, as a foam does not pull its platen for long. The strain not recovered is
+    `origins["start_strain"]`.
     """
     w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
     turn, end_of = cycle.turn, number if cycle.last is None else cycle.last
     assert w is not None  # it has cycles
-    free = float(np.median(_stress_between(record, cycles, cycle.place - 1)))
+    free, error = _level_between(record, cycles, cycle.place - 1)
     mean = smooth(stress, max(1, (top - cycle.first) // 100))
     rise = float(mean[top]) - free
     early = cycle.first + int(np.argmax(mean[cycle.first : top + 1] >= free + _EARLY * rise))
@@ -177,7 +178,7 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     def at_contact(values: Array) -> float:
         return float(values[last] + share * (values[last + 1] - values[last]))
 
-    level, offset = free + _LOADED * rise, min(free, 0.0)
+    level, offset = free + _LOADED * rise, free if free < -_SURE * error else 0.0
     back = np.flatnonzero(mean[turn : cycle.end] <= level)
     first, end = last + (share > 0.0), turn + int(back[0]) + 1 if back.size else cycle.end
     time = at_contact(record.instants)
@@ -216,8 +217,7 @@ def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
     """
     if cycle.last is None:
         return record
-    rest = _stress_between(record, cycles, cycle.place)
-    zero, error = float(np.median(rest)), float(np.std(rest)) / float(np.sqrt(rest.size))
+    zero, error = _level_between(record, cycles, cycle.place)
     if zero > -_SURE * error:
         return record
     record = replace(record.shifted("stress", zero), zeros=record.zeros | {"stress": error})
@@ -231,12 +231,13 @@ def _offset_note(when: str, zero: float) -> str:
     )
 
 
-def _stress_between(record: Record, cycles: list[Cycle], place: int) -> Array:
-    """Return the stresses at the lowest displacements between the peaks of two cycles."""
+def _level_between(record: Record, cycles: list[Cycle], place: int) -> tuple[float, float]:
+    """Return the stress at the lowest displacements between two peaks, and its standard error."""
     w, between = record.displacement, slice(cycles[place].top, cycles[place + 1].top)
     assert w is not None  # it has cycles
     lowest = w[between] <= w[between].min() + _LOWEST * np.ptp(w)
-    return np.asarray(record.stress[between][lowest])
+    rest = record.stress[between][lowest]
+    return float(np.median(rest)), float(np.std(rest)) / float(np.sqrt(rest.size))
 
 
 def _hinge(w: Array, stress: Array) -> float:

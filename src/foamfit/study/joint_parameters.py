@@ -307,9 +307,13 @@ def _with_words(
     result: JointResult, fit: JointFit, alone: Together, open_slopes: Mapping[str, float]
 ) -> JointResult:
     """Return a joint fit with its status, warnings and sentences."""
-    lost, large, wrong = dict[str, None](), list[Any](), list[Any]()
-    for (test, one), best in zip(result.tests.items(), fit.point.bests, strict=True):
+    lost, large, wrong, missed = dict[str, None](), list[Any](), list[Any](), list[float]()
+    every = zip(result.tests.items(), fit.point.bests, fit.point.errors, strict=True)
+    for (test, one), best, errors in every:
         objective = best.problem.objective
+        pairs = zip(objective.counted, errors, strict=True)
+        shares = [error.law / objective.span(curve) for curve, error in pairs if error.found]
+        missed += [max(shares)] if shares else []
         found = unsettled(best, contradictions(best.problem.measurement))
         wrong += [(test, each, objective.drive) for each in found]
         for curve in objective.counted:
@@ -328,6 +332,7 @@ def _with_words(
         "lost": list(lost),
         "large": large,
         "wrong": wrong,
+        "missed": missed,
         "together": _span_of(fit.found.misfits),
         "alone": _span_of(alone.misfits),
         "n_vary": fit.found.n_vary,
