@@ -29,7 +29,7 @@ MOTION_CURVES = ("displacement_time", "stress_strain")
 # A motion with less noise than this fraction of its range is exact. A smooth motion is used if its
 # residuals are at most this multiple of the noise.
 EXACT, FOLLOWED = 1e-6, 1.5
-TENSION = 0.005  # of the peak stress: the least that a specimen must bear to count as glued
+TENSION = 0.02  # of the peak stress: the least that a specimen must bear to count as glued
 # Largest time between contact and the first sample, in sampling intervals, for which the simulation
 # starts at the contact.
 LATEST = 50.0
