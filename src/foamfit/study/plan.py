@@ -132,10 +132,7 @@ def plan(
     def outcome(one: Candidate, *more: Seen) -> Outcome:
         risk = np.any([each.broken for each in more], axis=0)
         error = None if target is None else target.error(known, more)
-        found = expected(known, more)
-        # A further test takes nothing away, though the draws may lie where less is determined.
-        kept = {n for n, x in found.items() if now[n].state == "determined" != x.state}
-        found |= {name: now[name] for name in kept}
+        found = _no_worse(expected(known, more), now)
         if contradicted and one.drive == "impact":  # as in a fit, where the law errs as well
             found = {name: x.capped() for name, x in found.items()}
         return Outcome(one, float(np.mean(risk)), found, more[0].force, error, more[0].apart)
@@ -361,6 +358,15 @@ def _with_open(
         if one.place in open_ and one.param is not None:
             point[j] = rng.uniform(*one.param.start_limits)
     return space.decode(point)
+
+
+def _no_worse(found: dict[str, Expected], now: dict[str, Expected]) -> dict[str, Expected]:
+    """Return what is expected after further tests, which take nothing away.
+
+    The draws may lie where less is determined than at the best point.
+    """
+    kept = {name for name, one in found.items() if now[name].state == "determined" != one.state}
+    return found | {name: now[name] for name in kept}
 
 
 def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
