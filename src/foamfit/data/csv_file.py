@@ -117,7 +117,7 @@ def read_test(
             window=window,
             spread=settings.uncertainties.get("velocity", 0.0),
             stated=settings.noise,
-            late="delay" in settings.uncertainties,
+            late=bool(settings.uncertainties.get("delay")),
         )
     for channel, unit in (("stress", "Pa"), ("displacement", "m")):
         size, sigma = float(np.ptp(test.channels()[channel])), getattr(settings.noise, channel)

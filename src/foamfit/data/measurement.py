@@ -375,14 +375,14 @@ class Measurement(Samples):
         n = max((values.size for values in self.channels().values()), default=0)
         return self.count or RowCount(n, n)
 
-    @property
-    def is_velocity(self) -> bool:
-        """Whether a velocity alone was recorded, which was integrated and differentiated."""
-        return self.motion == FROM_VELOCITY and "stress" in self.derived
-
     def channels(self) -> dict[str, Array]:
         """Return the available ones of stress, displacement, acceleration, interior motions."""
         return self.curves("acceleration")
+
+
+def is_velocity(test: Record | Measurement) -> bool:
+    """Return whether a velocity alone was recorded, which was integrated and differentiated."""
+    return test.motion == FROM_VELOCITY and "stress" in test.derived
 
 
 def is_clipped(test: Measurement) -> bool:

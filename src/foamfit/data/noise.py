@@ -223,6 +223,12 @@ def smooth(values: Array, width: int) -> Array:
     return values if width < 2 else np.asarray(uniform_filter1d(values, width, mode="nearest"))
 
 
+def lowest_after_peak(stress: Array) -> tuple[float, int]:
+    """Return the lowest moving mean of a stress after its peak, and the number of its samples."""
+    width = max(1, stress.size // 100)
+    return float(smooth(stress, width)[int(np.argmax(stress)) :].min()), width
+
+
 def averaged(level: NoiseLevel, block: int) -> NoiseLevel:
     """Return the noise of the means of blocks of samples."""
     if block == 1:

@@ -15,7 +15,6 @@ from foamfit.data import contact, cycles, frames, zeros
 from foamfit.data import outliers as repair
 from foamfit.data.contact import Rise, rise_of
 from foamfit.data.measurement import (
-    FROM_VELOCITY,
     MEASURED,
     MIN_ROWS,
     Dropped,
@@ -28,15 +27,16 @@ from foamfit.data.measurement import (
     Striker,
     Window,
     interior_channel,
+    is_velocity,
 )
 from foamfit.data.noise import (
     averaged,
     estimated_noise,
     integrated_twice,
+    lowest_after_peak,
     noise_before_contact,
     noise_level,
     noise_of_integral,
-    smooth,
 )
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
@@ -119,7 +119,7 @@ def condition(
     block = -(-len(whole) // len(record))
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
-    if whole.motion == FROM_VELOCITY and "stress" in whole.derived:
+    if is_velocity(whole):
         assert whole.time is not None
         assert whole.velocity is not None
         step = float(np.median(np.diff(whole.time)))
@@ -385,11 +385,11 @@ def checks(
             raise InputError(f"{name} reaches {reached}; check its unit.")
         if largest > 1.05 * displacement.max():
             notes.append(f"Check: {name} goes farther than the top; check its unit and its node.")
-    stress, width, first = record.stress, max(1, len(record) // 100), record.stress[:3].mean()
+    stress, first = record.stress, record.stress[:3].mean()
     if first > 0.05 * peak:
         load = percent(first / peak)
         notes.append(f"Check: the record starts under load, at {load} of the peak stress.")
-    lowest = float(smooth(stress, width)[np.argmax(stress) :].min())
+    lowest, width = lowest_after_peak(stress)
     if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
         after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"
         notes.append(f"The stress goes down to {after}; it is kept.")

@@ -14,7 +14,7 @@ from foamfit.arrays import Array
 from foamfit.data.calibration import contradictions
 from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel, is_clipped
 from foamfit.data.motion import SmoothMotion, follow
-from foamfit.data.noise import smooth
+from foamfit.data.noise import lowest_after_peak
 from foamfit.errors import InputError
 from foamfit.options import DRIVES
 from foamfit.solve.scene import Motion
@@ -153,6 +153,12 @@ def driving_stress(stress: Array, model: Model) -> Array:
     return np.maximum(smooth, 0.0) if "unilateral" in model.kinds else smooth
 
 
+def is_exact(measurement: Measurement) -> bool:
+    """Return whether the motion of a test has no noise."""
+    values, level = measurement.displacement, measurement.noise.of("displacement")
+    return values is None or level is None or level.sigma <= EXACT * float(np.ptp(values))
+
+
 def driving_motion(
     measurement: Measurement, time: Array, *, always: bool = False
 ) -> SmoothMotion | None:
@@ -167,7 +173,7 @@ def driving_motion(
         return None
     counts = measurement.sampled.get("displacement")
     found = follow(time, values, level, counts)
-    if level.sigma <= EXACT * float(np.ptp(values)):
+    if is_exact(measurement):
         beside = np.abs(found.turns[:, None] - time).min(axis=1, initial=np.inf)
         return found if np.any(beside > 1e-6 * float(np.median(np.diff(time)))) else None
     if measurement.block > 1 and found.turns.size:
@@ -212,8 +218,7 @@ def is_slack(measurement: Measurement, model: Model) -> bool:
     stress, level = measurement.stress, measurement.noise.of("stress")
     if stress is None or measurement.last_cycle is not None or not model.relaxation:
         return measurement.last_cycle is not None
-    width = max(1, stress.size // 100)
-    lowest = float(smooth(stress, width)[int(np.argmax(stress)) :].min())
+    lowest, width = lowest_after_peak(stress)
     noise = 0.0 if level is None else 4.0 * level.sigma / math.sqrt(width)
     return lowest >= -max(TENSION * float(stress.max()), noise)
 

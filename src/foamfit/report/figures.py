@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import textwrap
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from foamfit.errors import InputError
 from foamfit.files import write_file
+from foamfit.text import wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -117,7 +117,7 @@ def _fitting(title: Sequence[str], width: float) -> list[str]:
     from matplotlib.textpath import TextPath
 
     for per_inch in (16, 14, 12, 10, 8):
-        lines = [line for part in title for line in textwrap.wrap(part, int(per_inch * width))]
+        lines = [line for part in title for line in wrapped(part, 0, int(per_inch * width))]
         paths = (TextPath((0.0, 0.0), line.replace("$", "S"), size=8) for line in lines)
         if max((path.get_extents().x1 for path in paths), default=0.0) <= 0.97 * 72.0 * width:
             break

@@ -15,11 +15,11 @@ from foamfit.data.measurement import Measurement
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError, check_whole
 from foamfit.fitting.curves import (
-    EXACT,
     check_drive,
     check_time_shift,
     choose_drive,
     driving_motion,
+    is_exact,
 )
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.scenes import channel_of
@@ -204,8 +204,7 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
     objective, same = problem.objective, source.sha256 == measurement.data_sha256
     if not same or source.smoothed is None or chosen != "displacement":
         return problem
-    level, moved = objective.measurement.noise.of("displacement"), measurement.displacement
-    if level is None or moved is None or level.sigma <= EXACT * float(np.ptp(moved)):
+    if is_exact(objective.measurement):
         return problem  # nothing is smoothed, but turns between samples are found
     # The fitted record, possibly with other cycles: smooth the motion only if the fit did.
     motion = driving_motion(objective.measurement, objective.time, always=source.smoothed)

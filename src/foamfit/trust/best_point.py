@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
+from foamfit.data.measurement import is_velocity
 from foamfit.fitting.branches import unreached
 from foamfit.fitting.links import RATES, factor
 from foamfit.fitting.nuisance import CONTACT_TIME
@@ -131,7 +132,7 @@ class BestPoint:
         objective = self.problem.objective
         # Noise of a driving stress, or of a velocity before its integration, has slow waves.
         slow = objective.drive == "stress"
-        slow = slow or (objective.drive == "impact" and self.problem.measurement.is_velocity)
+        slow = slow or (objective.drive == "impact" and is_velocity(self.problem.measurement))
         return self.residual, self.scaled, objective.sizes, taken, slow
 
     @property
