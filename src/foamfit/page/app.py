@@ -245,6 +245,7 @@ class Window:
         """Check the test with the values filled in, and show the outcome or the error."""
         self.run.disabled = True
         self._asked[PREPARING] += 1  # curves in preparation belong to the old test
+        self.curves.sliders.waiting = True  # a move would be lost
         given = self.inputs.given()
         self._beside(READING, lambda: self.desk.check(*given), self._show_checked)
 
@@ -259,6 +260,7 @@ class Window:
             self._refuse(error)
         self.inputs.mark("" if empty else missing)
         if str(error) == BUSY:
+            self.curves.sliders.waiting = False
             return
         self._offer(str(error))
         if error and (csv := self.desk.csv) is not None:
@@ -329,6 +331,7 @@ class Window:
             made.turn({})  # load the compiled code
             return made
 
+        self.curves.sliders.waiting = True
         what = f"Preparing the curves of {law_in_words(model, options['relaxation'])} …"
         if self.curves.turning is None and not self.compiling.object:
             self.misfit.object = piece("busy", what)

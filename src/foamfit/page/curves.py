@@ -67,6 +67,7 @@ class Curves:
             vars(row) | {"held": self.held.get(row.name, row.held)} | self._spans(row)
             for row in turning.rows
         ]
+        self.sliders.waiting = False
         self._draw({})
 
     def _spans(self, row: Row) -> dict[str, list[float]]:
@@ -84,7 +85,8 @@ class Curves:
     def hide(self) -> None:
         """Hide everything."""
         self.sliders.tell("")
-        self.turning, self._rows, self.sliders.rows = None, {}, []
+        self.turning, self._rows = None, {}
+        self.sliders.param.update(rows=[], waiting=False)
         self._panels.visible = False
 
     def chosen(self) -> tuple[dict[str, float], list[str]]:

@@ -85,6 +85,7 @@ class Sliders(JSComponent):
 
     rows = param.List()
     ticks = param.Boolean(doc="Whether each has a tick box that fixes it in a fit.")
+    waiting = param.Boolean(doc="Whether they are about to be replaced and cannot be moved.")
     told = param.String()
     wrong = param.Boolean()
 

@@ -101,11 +101,15 @@ export function render({ model, el }) {
     told.textContent = model.told;
     told.className = model.wrong ? "told error" : "told";
   }
+  function wait() {
+    list.inert = model.waiting;
+  }
   function tick() {
     list.className = model.ticks ? "list ticks" : "list";
   }
   model.on("rows", build);
   model.on("ticks", tick);
+  model.on("waiting", wait);
   model.on(["told", "wrong"], tell);
   model.on("msg:custom", (told) => {
     if (told.values) show(told.values);
@@ -114,4 +118,5 @@ export function render({ model, el }) {
   build();
   tell();
   tick();
+  wait();
 }
