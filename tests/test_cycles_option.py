@@ -169,7 +169,7 @@ def test_a_specimen_that_has_lost_contact_bears_no_tension(lifted: tuple[Path, C
     assert curve.min() == 0.0
     assert lost.sum() > 20
     assert np.std(made.residual(point)[: made.n_data]) == pytest.approx(1.0, abs=0.2)
-    pulling, there = of(replace(test, last_cycle=None), slack=False)
+    pulling, there = of(replace(test, last_cycle=None), glued=True)
     assert pulling.simulate(there).curves["stress_strain"].min() < -2e3
     alone, _ = of(replace(test, last_cycle=None))  # a record without tension
     assert np.array_equal(alone.simulate(point).curves["stress_strain"], curve)

@@ -8,7 +8,7 @@ import numpy as np
 
 from foamfit.arrays import Array, Integers
 from foamfit.data.measurement import Measurement, Record
-from foamfit.data.noise import noise_level, smooth
+from foamfit.data.noise import TENSION, noise_level, smooth
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
@@ -159,18 +159,21 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     The specimen is unloaded, or loaded least, at the lowest displacements between the cycles.
     Contact starts where a straight line through the early rise meets the level of the stress there,
     and ends where the stress returns to that level. A level clearly below zero is an offset of the
-    sensor, as a foam does not pull its platen for long. The strain not recovered is
-    `origins["start_strain"]`.
+    sensor, as a foam does not pull its platen for long. If the zero was measured before contact and
+    the tension is more than that of a loose specimen, it is glued: then the level is zero. The
+    strain not recovered is `origins["start_strain"]`.
     """
     w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
     turn, end_of = cycle.turn, number if cycle.last is None else cycle.last
     assert w is not None  # it has cycles
     free, error = _level_between(record, cycles, cycle.place - 1)
     mean = smooth(stress, max(1, (top - cycle.first) // 100))
+    glued = _is_glued(record, free, float(mean[top]))
+    free = 0.0 if glued else free
     rise = float(mean[top]) - free
     early = cycle.first + int(np.argmax(mean[cycle.first : top + 1] >= free + _EARLY * rise))
     part = slice(cycle.first, max(early, cycle.first + _FEWEST) + 1)
-    contact = _hinge(w[part], stress[part] - free)
+    contact = (_crossing if glued else _hinge)(w[part], stress[part] - free)
     last = min(part.start + int(np.flatnonzero(w[part] <= contact)[-1]), top - 1)
     ahead = float(w[last + 1] - w[last])
     share = (contact - float(w[last])) / ahead if ahead > 0.0 else 0.0
@@ -183,11 +186,14 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     first, end = last + (share > 0.0), turn + int(back[0]) + 1 if back.size else cycle.end
     time = at_contact(record.instants)
     moment = "" if record.time is None else f" {engineering(time, 's')} in the file,"
+    rises, returns = "from its level between the cycles", "to that level"
+    if glued:
+        rises, returns = "from tension through zero", "to zero (taken as glued)"
     notes = [
-        f"Contact of cycle {number} starts{moment} where the stress rises from its level between "
-        f"the cycles, at a strain of {percent(contact / height)} from the first contact (start "
-        f"strain, not recovered), which is taken off; {first - cycle.first} samples before and "
-        f"{cycle.end - end} after, where the stress has gone back to that level, are cut."
+        f"Contact of cycle {number} starts{moment} where the stress rises {rises}, at a strain of "
+        f"{percent(contact / height)} from the first contact (start strain, not recovered), which "
+        f"is taken off; {first - cycle.first} samples before and {cycle.end - end} after, where "
+        f"the stress has gone back {returns}, are cut."
     ]
     loaded = (level - offset) / (float(stress[top]) - offset)
     if offset < 0.0:
@@ -218,7 +224,7 @@ def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
     if cycle.last is None:
         return record
     zero, error = _level_between(record, cycles, cycle.place)
-    if zero > -_SURE * error:
+    if zero > -_SURE * error or _is_glued(record, zero, float(record.stress[cycle.top])):
         return record
     record = replace(record.shifted("stress", zero), zeros=record.zeros | {"stress": error})
     return record.noted(_offset_note("between the first two cycles", zero))
@@ -238,6 +244,22 @@ def _level_between(record: Record, cycles: list[Cycle], place: int) -> tuple[flo
     lowest = w[between] <= w[between].min() + _LOWEST * np.ptp(w)
     rest = record.stress[between][lowest]
     return float(np.median(rest)), float(np.std(rest)) / float(np.sqrt(rest.size))
+
+
+def _is_glued(record: Record, level: float, peak: float) -> bool:
+    """Return whether a stress between cycles is tension that only a glued specimen bears.
+
+    It is not the sensor's offset, as the zero was measured before contact.
+    """
+    error = record.zeros.get("stress", np.inf)
+    return level < -max(TENSION * peak, _SURE * error)
+
+
+def _crossing(w: Array, stress: Array) -> float:
+    """Return the displacement at which a stress rises through zero, from a line around it."""
+    near = np.abs(stress) <= float(stress[-1])
+    slope, level = np.polyfit(w[near], stress[near], 1)
+    return float(np.clip(-level / slope, w.min(), w.max()))
 
 
 def _hinge(w: Array, stress: Array) -> float:

@@ -16,6 +16,7 @@ from foamfit.data.measurement import Measurement, NoiseLevel
 
 MIN_REST = 20  # least number of samples for an estimate of their noise
 _WIDTHS = (5, 7, 11, 17, 25, 37, 55, 83, 125)  # of the local cubics, in samples
+TENSION = 0.02  # of the peak stress: the least that a specimen must bear to count as glued
 _SHARE = 12  # the widest cubic covers at most this fraction of the record, 1/12
 _CORRELATIONS = np.linspace(0.0, 0.98, 99)  # trial values of the lag-1 autocorrelation
 _SLOWEST = 0.95  # noise with a larger autocorrelation cannot be distinguished from the signal
@@ -223,10 +224,10 @@ def smooth(values: Array, width: int) -> Array:
     return values if width < 2 else np.asarray(uniform_filter1d(values, width, mode="nearest"))
 
 
-def lowest_after_peak(stress: Array) -> tuple[float, int]:
-    """Return the lowest moving mean of a stress after its peak, and the number of its samples."""
+def lowest_mean(stress: Array, first: int) -> tuple[float, int]:
+    """Return the lowest moving mean of a stress from a sample on, and the number of its samples."""
     width = max(1, stress.size // 100)
-    return float(smooth(stress, width)[int(np.argmax(stress)) :].min()), width
+    return float(smooth(stress, width)[first:].min()), width
 
 
 def averaged(level: NoiseLevel, block: int) -> NoiseLevel:

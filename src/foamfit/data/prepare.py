@@ -33,7 +33,7 @@ from foamfit.data.noise import (
     averaged,
     estimated_noise,
     integrated_twice,
-    lowest_after_peak,
+    lowest_mean,
     noise_before_contact,
     noise_level,
     noise_of_integral,
@@ -389,7 +389,7 @@ def checks(
     if first > 0.05 * peak:
         load = percent(first / peak)
         notes.append(f"Check: the record starts under load, at {load} of the peak stress.")
-    lowest, width = lowest_after_peak(stress)
+    lowest, width = lowest_mean(stress, int(np.argmax(stress)))
     if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
         after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"
         notes.append(f"The stress goes down to {after}; it is kept.")

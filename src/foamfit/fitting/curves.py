@@ -14,7 +14,7 @@ from foamfit.arrays import Array
 from foamfit.data.calibration import contradictions
 from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel, is_clipped
 from foamfit.data.motion import SmoothMotion, follow
-from foamfit.data.noise import lowest_after_peak
+from foamfit.data.noise import TENSION, lowest_mean
 from foamfit.errors import InputError
 from foamfit.options import DRIVES
 from foamfit.solve.scene import Motion
@@ -29,7 +29,6 @@ MOTION_CURVES = ("displacement_time", "stress_strain")
 # A motion with less noise than this fraction of its range is exact. A smooth motion is used if its
 # residuals are at most this multiple of the noise.
 EXACT, FOLLOWED = 1e-6, 1.5
-TENSION = 0.02  # of the peak stress: the least that a specimen must bear to count as glued
 # Largest time between contact and the first sample, in sampling intervals, for which the simulation
 # starts at the contact.
 LATEST = 50.0
@@ -210,17 +209,15 @@ def driven_instants(measurement: Measurement, clock: Array, motion: SmoothMotion
     return np.union1d(clock, more) if more else clock
 
 
-def is_slack(measurement: Measurement, model: Model) -> bool:
-    """Return whether the specimen can leave the platen: the record shows no tension after its peak.
-
-    Of several cycles fitted as one history it always can; without relaxation it has no reason to.
-    """
+def is_glued(measurement: Measurement) -> bool:
+    """Return whether the specimen is glued to its platens: a slow record shows tension."""
     stress, level = measurement.stress, measurement.noise.of("stress")
-    if stress is None or measurement.last_cycle is not None or not model.relaxation:
-        return measurement.last_cycle is not None
-    lowest, width = lowest_after_peak(stress)
+    if stress is None:
+        return False
+    several = measurement.last_cycle is not None  # the first peak need not be the highest
+    lowest, width = lowest_mean(stress, 0 if several else int(np.argmax(stress)))
     noise = 0.0 if level is None else 4.0 * level.sigma / math.sqrt(width)
-    return lowest >= -max(TENSION * float(stress.max()), noise)
+    return lowest < -max(TENSION * float(stress.max()), noise)
 
 
 def without_tension(motion: Motion) -> Motion:

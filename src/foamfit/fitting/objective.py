@@ -28,7 +28,7 @@ from foamfit.fitting.curves import (
     check_time_shift,
     checked_weights,
     interior_curves,
-    is_slack,
+    is_glued,
 )
 from foamfit.fitting.scenes import NOWHERE, Places, Scenes, channel_of
 from foamfit.fitting.starts import thinned
@@ -100,7 +100,7 @@ class Objective:
     given: tuple[nuisances.Prior, ...] = ()  # Priors of spring parameters
     followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is already known
     averaged: float = np.inf  # longest time that a sample averages, s, if the samples are thinned
-    slack: bool | None = None  # see `is_slack`; None: as the record shows
+    glued: bool | None = None  # see `is_glued`; None: as the record shows
     spent: Spent = field(default_factory=Spent)
     # Largest amplitude, in standard deviations, of the motion that would explain the residual
     unexplained: float | None = field(default=None, init=False)
@@ -117,10 +117,10 @@ class Objective:
         self._accelerated = self.drive == "impact" and test.acceleration is not None
         self.curves = (*CURVES, *((ACCELERATION,) if self._accelerated else ()), *self.interior)
         self.weights = checked_weights(self.weights, self.curves)
-        self.slack = is_slack(test, self.model) if self.slack is None else self.slack
+        self.glued = is_glued(test) if self.glued is None else self.glued
         self.scenes = Scenes(
             test, self.model, self.drive, self.curves, self.interior, self.nuisance, self.rtol,
-            self.interior_mass, self.followed, self.averaged, self.slack,
+            self.interior_mass, self.followed, self.averaged, self.glued,
         )  # fmt: skip
         self.time, self.usual = self.scenes.time, self.scenes.usual
         self.measured = self._measured()

@@ -88,7 +88,7 @@ class Scenes:
     interior_mass: bool
     followed: tuple[SmoothMotion | None, ...] = ()
     averaged: float = np.inf
-    slack: bool = True  # whether the specimen bears no tension under a given motion
+    glued: bool = False  # whether the specimen bears tension
     _asked: dict[tuple[bytes, bool], Wanted] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
@@ -112,6 +112,9 @@ class Scenes:
         self._dashpots = [i for i, name in enumerate(self.model.names[:-1]) if name.endswith("eta")]
         # Whether all samples share one clock and no reading is averaged.
         self._plain = self._fine == 1 and self._own is None
+        # Without relaxation a specimen has no reason to leave the platen within one cycle.
+        leaves = bool(self.model.relaxation) or test.last_cycle is not None
+        self._slack = leaves and not self.glued
         self._one = np.array([test.specimen.height])
         self.plans = self._make(self._loading())
 
@@ -278,7 +281,7 @@ class Scenes:
         inside = everything or any(name in self.interior for name in counted)
         plan, late = self._placed(self.plans[damped], at), at.get(nuisances.TIME_SHIFT, 0.0)
         motion = run(plan, inside)
-        if self.driven and self.slack:
+        if self.driven and self._slack:
             motion = without_tension(motion)
         shown = motion
         if late != 0.0 and self.drive == "impact":
@@ -320,7 +323,10 @@ class Scenes:
         """Return the plan with contact time, striker and zero of the driving motion applied."""
         zero = at.get("displacement_zero", 0.0)
         if self.driven and (zero != 0.0 or self.measurement.contact != "file"):
-            return plan._replace(values=np.maximum(plan.values - zero, 0.0))  # no contact below
+            moved = plan.values - zero  # below zero there is no contact
+            touched = int(np.argmax(moved > 0.0)) if self.glued else moved.size
+            np.maximum(moved[:touched], 0.0, out=moved[:touched])
+            return plan._replace(values=moved)
         if self.drive != "impact":
             return plan
         mass = plan.mass.copy()

@@ -106,7 +106,7 @@ def at_samples(strain: Array, moved: bool) -> Array:
     """
     out = np.zeros((strain.size, 4))
     if moved:
-        contact = (strain > 0.0).astype(float)
+        contact = (strain != 0.0).astype(float)
         out[:, 0] = contact
         for j in np.flatnonzero(np.diff(contact)) + 1:  # contact begins or ends before this sample
             out[j, :2] = 0.0, 1.0 / (strain[j] - strain[j - 1]) * (contact[j] - contact[j - 1])
