@@ -169,13 +169,33 @@ def curve_errors(
     one. A process that scatters about local cubics more than `ROUGHER` times as much as the
     residual cannot be its noise; such a residual also contains model error. If the test is `driven`
     by a stress, all is taken as noise: noise of the stress passes through the springs as slow waves
-    of the displacement, which look like model error.
+    of the displacement, which look like model error. So does the noise of one curve that a fit
+    leaves in another, more exact one, if it does not weigh both by their noise: what a fit by the
+    noise would take away is no model error (one test alone).
     """
     basis = basis_of(jacobian) if taken is None else taken
     own = noise_processes(residual, jacobian, sizes, taken)
-    return tuple(
+    found = tuple(
         CurveError(process) if driven else _curve_error(residual[part], basis[part], process)
         for part, process in zip(parts(sizes), own, strict=True)
+    )
+    errs = [error.found for error in found]
+    if taken is not None or all(errs) or not any(errs):
+        return found
+    units = np.ones(residual.size)
+    for part, error in zip(parts(sizes), found, strict=True):
+        units[part] = max(math.sqrt(error.noise.variance), 1e-300)
+    left, slopes = residual / units, jacobian / units[:, None]
+    axes = basis_of(slopes)
+    left -= axes @ (axes.T @ left)
+    own = noise_processes(left, slopes, sizes)
+    again = (_curve_error(left[p], axes[p], one) for p, one in zip(parts(sizes), own, strict=True))
+    firsts = [units[part.start] for part in parts(sizes)]
+    return tuple(
+        CurveError(replace(new.noise, variance=new.noise.variance * unit**2), new.evidence)
+        if error.found and not new.found
+        else error
+        for error, new, unit in zip(found, again, firsts, strict=True)
     )
 
 
