@@ -170,7 +170,8 @@ def unlike(tmp_path_factory):
     here, deviates = tmp_path_factory.mktemp("unlike"), np.array([-1.2, -0.6, 0.1, 0.4, 1.3])
     for i, z in enumerate(deviates):
         write_test(here, f"t{i}", seed=i, noise=0.1 * NOISE, k0=5.5e5 * (1.0 + 0.05 * z))
-    study = write_study(here, "\n".join(f'{name} = "shared"' for name in NAMES))
+    kinds = dict.fromkeys(NAMES, "shared") | {"s1_sigma_minus": "own"}
+    study = write_study(here, "\n".join(f'{name} = "{kind}"' for name, kind in kinds.items()))
     return ff.joint(study), 5.5e5 * 0.05 * np.std(deviates, ddof=1) / 5**0.5
 
 
@@ -185,6 +186,10 @@ def test_the_range_of_a_shared_value_holds_that_of_a_mean_over_other_specimens(u
     assert "its range is ±" in k0.why
     content = json.loads(json.dumps(joint.to_json_dict()))
     assert content["parameters"]["s1_k0"]["range"] == list(k0.range)
+    # A value of one test has a range too: without, it was called determined though the law errs.
+    own = joint.parameters["s1_sigma_minus"].tests["t0"]
+    assert own.range[0] < own.value < own.range[1]
+    assert own.range[1] - own.range[0] > own.ci95[1] - own.ci95[0]
 
 
 def test_evidence_chooses_a_kind(folder):

@@ -20,11 +20,12 @@ from foamfit.errors import SimulationError
 from foamfit.fitting.box import is_logarithmic
 from foamfit.fitting.links import RATES, Links
 from foamfit.fitting.problem import Problem
+from foamfit.fitting.search import Tracker
 from foamfit.fitting.together import Together, fit_linked
 from foamfit.springs.parameters import NUISANCE, split_name
 from foamfit.trust import covariance
-from foamfit.trust.best_point import JointPoint
-from foamfit.trust.ranges import ITERATIONS, TRIALS, nearer, tolerance
+from foamfit.trust.best_point import BestPoint, JointPoint
+from foamfit.trust.ranges import ITERATIONS, TRIALS, left_open, nearer, tolerance
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.scatter import Spread, common_and_spread, correlation
 
@@ -38,6 +39,7 @@ SAYS_NOTHING = 5.0
 GROUPS = 10  # largest number of groups of tests that are left out in turn
 REFIT = 15  # iterations of a fit without one group
 Vectors = Sequence[Array]  # Parameters of each test
+Ends = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +48,8 @@ class JointFit:
 
     point: JointPoint
     spreads: Mapping[str, Spread] = field(default_factory=dict)
-    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # See `ranges_of`
+    ranges: Mapping[str, Ends] = field(default_factory=dict)  # See `ranges_of`
+    own: tuple[Mapping[str, Ends], ...] = ()  # of each test, see `own_ranges`
     correlation: tuple[tuple[str, ...], Array] = ((), np.empty((0, 0)))  # See `correlation_of`
 
     @property
@@ -71,7 +74,9 @@ def fit_jointly(problems: Sequence[Problem], links: Links, starts: Sequence[Vect
             break
         found = fit_linked(problems, replace(links, pulls=pulls), [found.values])
         point = JointPoint(found, errors, inflations)
-    return JointFit(point, spreads, ranges_of(point), correlation_of(point, undrawn))
+    ranges = ranges_of(point)
+    own = own_ranges(point, ranges)
+    return JointFit(point, spreads, ranges, own, correlation_of(point, undrawn))
 
 
 def _spread(point: JointPoint, name: str) -> tuple[Array, Spread, Array, Array] | None:
@@ -143,7 +148,7 @@ def errors_of(found: Together) -> tuple[tuple[CurveError, ...], ...]:
     return tuple(curve_errors(*best.to_judge(point.taken(t))) for t, best in every)
 
 
-def ranges_of(point: JointPoint) -> dict[str, tuple[float, float]]:
+def ranges_of(point: JointPoint) -> dict[str, Ends]:
     """Return ranges of shared values and slopes of rate laws (":b") due to model error.
 
     A range is the hull of two: the 95 % interval of a value found from the same number of other
@@ -162,7 +167,36 @@ def ranges_of(point: JointPoint) -> dict[str, tuple[float, float]]:
     return out
 
 
-def _over_specimens(found: Together) -> dict[str, tuple[float, float]]:
+def own_ranges(point: JointPoint, ranges: Mapping[str, Ends]) -> tuple[dict[str, Ends], ...]:
+    """Return the ranges due to model error of the values that each test has for itself.
+
+    A range is the hull of two: values that fit the test almost equally well while the shared values
+    stay where they are (`trust.ranges`); and what the ends of the range of each shared value make
+    of it, to first order.
+    """
+    out = []
+    for best in point.bests:
+        problem, values = best.problem, best.values
+        shared = [name for name in best.names if name in point.found.shared]
+        shared = [name for name in shared if point.found.links.kind(name) != "scatter"]
+        for name in shared:
+            problem = problem.holding(name, best.value(name))
+        alone = BestPoint(problem, values)
+        found = left_open(alone, (), Tracker(problem.objective), descents=False).ranges
+        moves = np.linalg.pinv(alone.scaled, rcond=1e-10) @ problem.slopes(values, tuple(shared))
+        for name, column in zip(shared if found else (), moves.T, strict=False):
+            common, value = point.found.common[name][0], best.value(name)
+            for end in ranges.get(name, ()):
+                change = (end - common) * (value / common if common else 1.0)
+                steps = -alone.sizes * column * change
+                moved = np.clip(values[alone.places] + steps, *alone.box).tolist()
+                pairs = zip(alone.names, moved, strict=True)
+                found |= {n: (min(found[n][0], x), max(found[n][1], x)) for n, x in pairs}
+        out.append(found)
+    return tuple(out)
+
+
+def _over_specimens(found: Together) -> dict[str, Ends]:
     """Return ranges of shared values and slopes from fits without each group of tests."""
     count = len(found.problems)
     groups = [range(first, count, GROUPS) for first in range(min(count, GROUPS))]
@@ -170,7 +204,7 @@ def _over_specimens(found: Together) -> dict[str, tuple[float, float]]:
     others = [common for one in kept if (common := _without(found, one))]
     if len(others) < 2:
         return {}
-    out, quantile = dict[str, tuple[float, float]](), covariance.half_width(1.0, len(others) - 1)
+    out, quantile = dict[str, Ends](), covariance.half_width(1.0, len(others) - 1)
     for name in found.shared:
         values = np.array([common[name] for common in others if name in common])
         if len(values) < len(others):  # only one group has the parameter

@@ -135,7 +135,7 @@ def _estimates(
         if param.vary:
             at = one.in_test(test)
             method = at.ci95 and "local covariance"
-            out[name] = replace(at, value=value, ci95_method=method, range=None)
+            out[name] = replace(at, value=value, ci95_method=method)
         else:
             why = "held fixed" if param.expr is None else f"tied by {param.expr}"
             out[name] = ParameterEstimate(value, None, None, one.unit, False, "fixed", why)
@@ -298,7 +298,9 @@ def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, Param
             why = f"branch {branch} was never reached"
             one = replace(one, state="not determined", why=why)
         else:
-            one = _judged(fit, t, name, one.value, fit.point.of_test(t, name))
+            span = fit.own[t].get(name)
+            one = _judged(fit, t, name, one.value, fit.point.of_test(t, name), span)
+            one = replace(one, range=span)
         out[test] = one.counted_from(-problem.measurement.origins.get(name, 0.0))
     return out
 
