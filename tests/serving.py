@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import pytest
@@ -13,8 +14,14 @@ from conftest import EXPERIMENTS
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
+    """Serve the page for all tests of a module."""
+    with serving(tmp_path_factory.mktemp("files")) as page:
+        yield page
+
+
+@contextmanager
+def serving(files):
     """Serve the page and yield its address, process and folder of files."""
-    files = tmp_path_factory.mktemp("files")
     process = subprocess.Popen(
         [sys.executable, "-m", "foamfit", "page", "--no-browser"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
