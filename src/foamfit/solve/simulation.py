@@ -51,7 +51,7 @@ THINNED = 4  # share of the samples of an impact at which they are compared
 LOST = 0.03  # shorter steps do not help where two runs differ by more than this
 
 
-@dataclass(eq=False)  # freezing it would cost 5 % of a short run
+@dataclass(eq=False, repr=False)  # freezing it would cost 5 % of a short run
 class Response:
     """Response of a chain to a drive."""
 
@@ -71,6 +71,12 @@ class Response:
     steps: int  #: number of integration steps; 0 for the closed form
     #: derivatives by the requested parameters
     sensitivities: dict[str, Sensitivity] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Return a line without arrays."""
+        stress, strain = self.base_stress.max(), self.strain.max()
+        peaks = f"peak base stress {stress:.4g} Pa, peak strain {strain:.4g}"
+        return f"Response at {self.time.size} times: {peaks} ({self.method})"
 
     @property
     def strain(self) -> Array:
