@@ -172,6 +172,8 @@ def unlike(tmp_path_factory):
         write_test(here, f"t{i}", seed=i, noise=0.1 * NOISE, k0=5.5e5 * (1.0 + 0.05 * z))
     kinds = dict.fromkeys(NAMES, "shared") | {"s1_sigma_minus": "own"}
     study = write_study(here, "\n".join(f'{name} = "{kind}"' for name, kind in kinds.items()))
+    heavy = here / "foam.toml"
+    heavy.write_text(heavy.read_text().replace("[specimen]", '[specimen]\nmass = "1 kg"'))
     return ff.joint(study), 5.5e5 * 0.05 * np.std(deviates, ddof=1) / 5**0.5
 
 
@@ -186,6 +188,7 @@ def test_the_range_of_a_shared_value_holds_that_of_a_mean_over_other_specimens(u
     assert "its range is ±" in k0.why
     content = json.loads(json.dumps(joint.to_json_dict()))
     assert content["parameters"]["s1_k0"]["range"] == list(k0.range)
+    assert any(one.startswith("Check t0, t1, t2 and 2 more: mass and") for one in joint.warnings)
     # A value of one test has a range too: without, it was called determined though the law errs.
     own = joint.parameters["s1_sigma_minus"].tests["t0"]
     assert own.range[0] < own.value < own.range[1]

@@ -25,6 +25,7 @@ from foamfit.fitting.together import Together, fit_linked
 from foamfit.springs.parameters import NUISANCE, split_name
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint, JointPoint
+from foamfit.trust.covariance import Ends
 from foamfit.trust.ranges import ITERATIONS, TRIALS, left_open, nearer, tolerance
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.scatter import Spread, common_and_spread, correlation
@@ -39,7 +40,6 @@ SAYS_NOTHING = 5.0
 GROUPS = 10  # largest number of groups of tests that are left out in turn
 REFIT = 15  # iterations of a fit without one group
 Vectors = Sequence[Array]  # Parameters of each test
-Ends = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)

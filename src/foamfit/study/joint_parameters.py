@@ -14,6 +14,8 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.calibration import contradictions
+from foamfit.data.measurement import ASKED
+from foamfit.data.zeros import CONTRADICTED
 from foamfit.fitting.links import RATES
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
@@ -310,13 +312,18 @@ def _with_words(
 ) -> JointResult:
     """Return a joint fit with its status, warnings and sentences."""
     lost, large, wrong, missed = dict[str, None](), list[Any](), list[Any](), list[float]()
+    doubts = dict[str, list[str]]()  # tests by their notes about probable errors in the input
     every = zip(result.tests.items(), fit.point.bests, fit.point.errors, strict=True)
     for (test, one), best, errors in every:
         objective = best.problem.objective
         pairs = zip(objective.counted, errors, strict=True)
         shares = [error.law / objective.span(curve) for curve, error in pairs if error.found]
         missed += [max(shares)] if shares else []
-        found = unsettled(best, contradictions(best.problem.measurement))
+        measurement = best.problem.measurement
+        found = unsettled(best, contradictions(measurement))
+        for note in measurement.notes:
+            if note.startswith(ASKED) and CONTRADICTED not in note:
+                doubts.setdefault(note.removeprefix(ASKED).strip(), []).append(test)
         wrong += [(test, each, objective.drive) for each in found]
         for curve in objective.counted:
             misfit, measured = one.misfit[curve], objective.measured[curve]
@@ -334,6 +341,7 @@ def _with_words(
         "lost": list(lost),
         "large": large,
         "wrong": wrong,
+        "doubts": doubts,
         "missed": missed,
         "together": _span_of(fit.found.misfits),
         "alone": _span_of(alone.misfits),
