@@ -132,6 +132,20 @@ def test_a_time_of_day(tmp_path, head, day, sep, decimal):
     refused(path, "row 3", "9:59:61'; it must be a number")
 
 
+def test_a_time_of_day_in_twelve_hours_past_midnight(tmp_path):
+    """A clock of a laboratory PC: 11:59:59.5 PM, then 12:00:00.0 AM."""
+    halves = [
+        f"{(t // 3600 + 11) % 12 + 1:.0f}:{t // 60 % 60:02.0f}:{t % 60:07.4f} {half}"
+        for t in 23 * 3600 + 59 * 60 + 58.5 + TIME
+        for half in ["PM" if t < 24 * 3600 else "AM"]
+    ]
+    body = [f"{t},{more}" for t, more in zip(halves, rows(FORCE, MOTION), strict=True)]
+    path = write(tmp_path, ["Timestamp,force (N),displacement (mm)", *body])
+    assert "12:00:00" in path.read_text()
+    assert "11:59:59" in path.read_text()
+    expect(read_test(path))
+
+
 def test_columns_of_fixed_width(tmp_path):
     width = "{:>10}{:>18}{:>22}{:>8}"
     head = [

@@ -30,8 +30,12 @@ _ABOVE = 40  # number of rows compared with the last row
 _NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?)", re.IGNORECASE | re.ASCII
 )
-# A time of day such as 12:00:00.5, with or without a date before it.
-_OF_DAY = re.compile(r"(?:[\d./-]+[T ]+)?(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,]\d+)?)", re.ASCII)
+# A time of day such as 12:00:00.5 or 3:00:00.5 PM, with or without a date before it.
+_OF_DAY = re.compile(
+    r"(?:[\d./-]+[T ]+)?(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,]\d+)?)(?: ?([ap])m)?",
+    re.IGNORECASE | re.ASCII,
+)
+DAY = 86400.0  # s
 
 
 @dataclass(frozen=True)
@@ -300,6 +304,9 @@ def read_numbers(
         _refuse_thousands(table, k, values)
         if table.clock is not None and k == 0:
             values[:] = table.clock[0] + table.clock[1] * values
+    if "time" in columns and table.is_of_day(columns["time"]):  # past midnight
+        time = read[[*columns].index("time")]
+        time[:] = np.unwrap(time, period=DAY)
     return dict(zip(columns, read, strict=True)), rows, np.array(empty, dtype=np.int64)
 
 
@@ -349,8 +356,7 @@ def _checked_numbers(table: Table, columns: dict[str, int]) -> tuple[Array, Inte
             continue
         of_day = _OF_DAY.fullmatch(cells[columns["time"]]) if "time" in columns else None
         if of_day is not None:
-            hours, minutes, seconds = (float(one.replace(",", ".")) for one in of_day.groups())
-            total = repr(3600.0 * hours + 60.0 * minutes + seconds)
+            total = repr(_since_midnight(*of_day.groups()))
             cells[columns["time"]] = total.replace(".", table.decimal)
         wrongs = ((table.headers[k].text, _wrong(cells[k], table.decimal)) for k in places)
         if bad := next((f"{name!r} is {wrong}" for name, wrong in wrongs if wrong), None):
@@ -364,6 +370,12 @@ def _checked_numbers(table: Table, columns: dict[str, int]) -> tuple[Array, Inte
         raise below[0][1]
     read = np.array(numbers).reshape(-1, len(places)).T.copy()
     return read, np.array(rows), sorted([*empty, *(row for row, _ in below)])
+
+
+def _since_midnight(hours: str, minutes: str, seconds: str, half: str | None) -> float:
+    """Return a time of day in s; `half` is "a" or "p" on a clock of twelve hours."""
+    hour = float(hours) if half is None else float(hours) % 12.0 + 12.0 * (half in "pP")
+    return 3600.0 * hour + 60.0 * float(minutes) + float(seconds.replace(",", "."))
 
 
 def _refuse_thousands(table: Table, column: int, values: Array) -> None:

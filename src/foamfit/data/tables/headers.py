@@ -28,7 +28,7 @@ class Channel(NamedTuple):
 
 _MOVED = "displacement disp weg standardweg verschiebung stauchung compression"
 CHANNELS = {
-    "time": Channel("s", "ms", "time t zeit prüfzeit testzeit versuchszeit"),
+    "time": Channel("s", "ms", "time t zeit prüfzeit testzeit versuchszeit timestamp"),
     "stress": Channel("Pa", "MPa", "stress sigma druckspannung spannung"),
     "force": Channel("N", "N", "force load f kraft standardkraft prüfkraft druckkraft"),
     "displacement": Channel("m", "mm", _MOVED),
