@@ -208,6 +208,7 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     moved = replace(
         moved,
         interior={node: values - at_contact(values) for node, values in record.interior.items()},
+        zeros={name: record.zeros[name] for name in moved.zeros.keys() & {"stress"}},
         origins=moved.origins | {"start_strain": contact / height},
         notes=(*cut_to_cycle(record, cycles, cycle).notes, *notes),
     )

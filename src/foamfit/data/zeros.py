@@ -8,7 +8,14 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.contact import ELSEWHERE, Levels, Start, motion_leaves_rest
-from foamfit.data.measurement import GRAVITY, UNITS, NoiseLevel, Record, Striker
+from foamfit.data.measurement import (
+    GRAVITY,
+    UNITS,
+    NoiseLevel,
+    Record,
+    Striker,
+    interior_channel,
+)
 from foamfit.data.noise import (
     MIN_REST,
     NOTHING,
@@ -136,7 +143,7 @@ def take_zeros(
         else:
             zero, source = _zero_of_motion(name, first, start, n, noise, impact=impact)
             top = name == "displacement"
-            if top and start.gauge == "rest" and n >= _FEWEST:
+            if n >= _FEWEST and (not top or start.gauge == "rest"):
                 errors[name] = zero.error
             if abs(zero.value) > (0.0 if top else 1e-3 * np.ptp(values)):
                 label, size = "The displacement" if top else name, engineering(zero.value, "m")
@@ -240,13 +247,23 @@ def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker)
 
 
 def mark_flight(record: Record, start: Start, span: Span, levels: Levels) -> Record:
-    """Mark rows in which the gauge does not follow the striker as not measured."""
+    """Mark rows in which a gauge does not follow the striker or the specimen as not measured.
+
+    After contact the specimen may stay on its base or leave with the striker: its interior motions
+    are then not compared.
+    """
+    touching = np.arange(len(record)) < span.leaves - span.first
+    inner = {
+        name: record.sampled.get(name, touching) & touching
+        for name in map(interior_channel, record.interior)
+    }
+    record = replace(record, sampled=record.sampled | inner)
     if record.displacement is None or start.gauge in ("flight", ""):
         return record
     step = float(np.median(np.diff(record.instants)))
     moves = record.instants > max(2.5 * step, 2 * start.error)
     if start.gauge == "rest":
-        moves[span.leaves - span.first :] = False
+        moves &= touching
         if at := motion_leaves_rest(record, levels):  # possibly late
             moves &= record.instants > at[0] + max(2.5 * step, 2 * at[1])
     kept = record.sampled.get("displacement", np.ones(len(record), dtype=bool))

@@ -6,6 +6,7 @@ loop. Only curves with a weight above zero count, so that no measurement counts 
 
 from __future__ import annotations
 
+import math
 import time
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -149,6 +150,7 @@ class Objective:
             (name, slice(None) if all_ else self.kept(name), self.factor(name), slice(first, end))
             for name, all_, first, end in zip(self.counted, every, ends[:-1], ends[1:], strict=True)
         ]
+        self._unzeroed = {name: self._open_zero(name) for name in self.interior}
         self._target = np.concatenate([self.measured[name][kept] for name, kept, *_ in self._parts])
         known = nuisances.priors_of(self.measurement, self.drive)
         self.priors = (*self.given, *(known[name] for name in self.nuisance if name in known))
@@ -156,6 +158,22 @@ class Objective:
         self._prior_places = np.array([names.index(one.name) for one in self.priors], np.int64)
         self._means = np.array([one.mean for one in self.priors])
         self._sigmas = np.array([one.sigma for one in self.priors])
+
+    def _open_zero(self, name: str) -> float:
+        """Return the share of its mean that is taken off the residual of an interior motion.
+
+        The unknown zero of the gauge, with a normal prior of its error before contact (none if it
+        was not at rest there), shifts all samples. The likelihood is integrated over it.
+        """
+        error = self.measurement.zeros.get(channel_of(name))
+        if error is None:
+            return 1.0
+        return 1.0 - 1.0 / math.sqrt(1.0 + self._kept[name].size * (error * self.factor(name)) ** 2)
+
+    def offset(self, name: str, curve: Array) -> float:
+        """Return the zero of an interior motion in view of its simulated curve, m; else 0."""
+        miss = (self.measured[name] - curve)[self._kept[name]]
+        return self._unzeroed.get(name, 0.0) * float(miss.mean())
 
     def thinned(self) -> Objective:
         """Return the objective of a few hundred samples, or this one if it has no more.
@@ -322,6 +340,8 @@ class Objective:
             out[:, at] = rows[name][:, kept]
             out[0, at] -= self._target[at]
             out[:, at] *= factor
+            if share := self._unzeroed.get(name):
+                out[:, at] -= share * out[:, at].mean(axis=1, keepdims=True)
         return out
 
     def _bounded(self, off: Array, values: Array) -> Array:
@@ -423,5 +443,5 @@ class Objective:
         measured, simulated = self.measured.get(name), curves.curves.get(name)
         if measured is None or simulated is None:
             return None
-        miss = (simulated - measured)[self._kept[name]]
+        miss = (simulated + self.offset(name, simulated) - measured)[self._kept[name]]
         return float(np.sqrt(np.mean(miss**2)) / np.ptp(measured))
