@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.signal import savgol_filter
 
@@ -29,6 +30,7 @@ MOTION_CURVES = ("displacement_time", "stress_strain")
 # A motion with less noise than this fraction of its range is exact. A smooth motion is used if its
 # residuals are at most this multiple of the noise.
 EXACT, FOLLOWED = 1e-6, 1.5
+LOADED = 0.01  # share of the peak stress from which there certainly is load
 # Largest time between contact and the first sample, in sampling intervals, for which the simulation
 # starts at the contact.
 LATEST = 50.0
@@ -141,15 +143,30 @@ def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> d
     return weights
 
 
-def driving_stress(stress: Array, model: Model) -> Array:
-    """Smooth a measured stress (Pa) that drives a model.
+def driving_stress(measurement: Measurement, model: Model) -> Array:
+    """Smooth the measured stress (Pa) of a test that drives a model; it is zero before contact.
 
     Noise of a driving stress biases the soft branches (errors in variables); a moving parabola over
-    a twenty-fifth of the samples removes it. Chains with a unilateral spring carry no tension.
+    a twenty-fifth of the samples removes it. Loading and unloading have their own, as one across
+    the peak would cut it off. Chains with a unilateral spring carry no tension.
     """
-    window = 2 * (stress.size // 50) + 1
-    smooth = savgol_filter(stress, window, 2) if window > 3 else stress
+    stress, time = measurement.stress, measurement.time
+    assert stress is not None  # checked by check_drive
+    window, begins = 2 * (stress.size // 50) + 1, (measurement.rise or (0.0, 0.0))[0]
+    begin = int(np.searchsorted(np.arange(stress.size) if time is None else time, begins))
+    top = begin + int(np.argmax(stress[begin:]))
+    smooth = np.zeros(stress.size)
+    for part in (slice(begin, top), slice(top, None)):
+        own = stress[part]
+        smooth[part] = savgol_filter(own, window, 2) if own.size > window > 3 else own
     return np.maximum(smooth, 0.0) if "unilateral" in model.kinds else smooth
+
+
+def shows_motion(stress: Array) -> NDArray[np.bool_]:
+    """Return in which samples a driving stress shows the motion: from contact to its end."""
+    loaded = np.flatnonzero(stress > LOADED * stress.max())
+    rows = np.arange(stress.size)
+    return np.asarray((np.cumsum(stress != 0.0) > 0) & (rows <= loaded[-1]))
 
 
 def is_exact(measurement: Measurement) -> bool:

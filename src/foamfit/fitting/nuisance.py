@@ -1,10 +1,10 @@
 """Nuisance parameters: contact time, zeros of the channels, striker, force scale and time shift.
 
 They are fitted together with the parameters of the springs: all of them in an impact, the zeros of
-motion and stress under a driving motion. Times and zeros are relative to the values found by the
-loader (`Measurement.origins`), 0 for an exact record; velocity and mass are those of the TOML.
-`shown_by` returns what the record says of them without a law of the springs; their limits follow
-from it.
+motion and stress under a driving motion, that of the motion under a driving stress. Times and zeros
+are relative to the values found by the loader (`Measurement.origins`), 0 for an exact record;
+velocity and mass are those of the TOML. `shown_by` returns what the record says of them without a
+law of the springs; their limits follow from it.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ POSITIVE = (*STRIKER, FORCE_SCALE)  # positive parameters, each of which is its 
 UNDER_DRIVE = {
     "impact": (CONTACT_TIME, *ZEROS, *STRIKER, FORCE_SCALE),
     "displacement": ("displacement_zero", "stress_zero"),
+    "stress": ("displacement_zero",),
 }
 # Limits of a parameter with a prior, and of one that the first rise shows, in standard deviations.
 REACH, REACH_OF_RISE = 6.0, 5.0

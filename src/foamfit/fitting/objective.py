@@ -28,8 +28,10 @@ from foamfit.fitting.curves import (
     check_drive,
     check_time_shift,
     checked_weights,
+    driving_stress,
     interior_curves,
     is_glued,
+    shows_motion,
 )
 from foamfit.fitting.scenes import NOWHERE, Places, Scenes, channel_of
 from foamfit.fitting.starts import thinned
@@ -269,6 +271,8 @@ class Objective:
         channel = channel_of(name)
         counts = self.measurement.sampled.get(channel, np.ones(self.time.size, dtype=bool))
         outliers = self.measurement.outliers.get(channel)
+        if self.drive == "stress":
+            counts = counts & shows_motion(driving_stress(self.measurement, self.model))
         return np.flatnonzero(counts if outliers is None else counts & ~outliers.left_out)
 
     # ------------------------------------------------------------------ simulation and residual

@@ -156,8 +156,7 @@ class Scenes:
             usual = self.usual
             return Impact(usual[nuisances.STRIKER_MASS], usual[nuisances.VELOCITY], self._gravity)
         if self.drive == "stress":
-            assert self.measurement.stress is not None
-            return StressDrive(driving_stress(self.measurement.stress, self.model))
+            return StressDrive(driving_stress(self.measurement, self.model))
         return DisplacementDrive(self._moved)
 
     def _make(self, loading: Drive) -> dict[bool, Plan]:
@@ -337,11 +336,9 @@ class Scenes:
         )
 
     def _followed(self, plan: Plan, at: dict[str, float]) -> Plan:
-        """Return the plan along the measured motion of an impact, zero without contact."""
-        if self.drive != "impact":
-            return plan
-        values = np.maximum(plan.values - at["displacement_zero"], 0.0)
-        before = self.clock < at[nuisances.CONTACT_TIME]
+        """Return the plan along the measured motion, zero without contact."""
+        values = np.maximum(plan.values - at.get("displacement_zero", 0.0), 0.0)
+        before = self.clock < at.get(nuisances.CONTACT_TIME, -np.inf)
         return plan._replace(values=np.where(before, 0.0, values))
 
     def _sampled(self, values: Array) -> Array:

@@ -16,7 +16,7 @@ from types import MappingProxyType
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.errors import InputError
+from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
 from foamfit.results import Intervals, Profile
 from foamfit.springs.parameters import NUISANCE
@@ -200,8 +200,12 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
     if not np.any(left > 0.0):
         return np.full(left.shape, np.nan)
     other = BestPoint(best.problem, point, best.names)
+    try:
+        halves = other.halves
+    except SimulationError:  # the stress along the measured motion need not exist there
+        return np.full(left.shape, np.nan)
     with np.errstate(invalid="ignore"):
-        return np.where(left > 0.0, other.halves * np.sqrt(left), np.nan)
+        return np.where(left > 0.0, halves * np.sqrt(left), np.nan)
 
 
 def _by_profiles(
