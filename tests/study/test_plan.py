@@ -11,6 +11,7 @@ import pytest
 
 import foamfit as ff
 from conftest import run, run_refused, write_csv
+from foamfit.data import rig as rigs
 from foamfit.data.measurement import INTEGRATED, MEASURED, Measurement, Noise, Specimen, Striker
 from foamfit.data.rig import Candidate, candidates, read_rig
 from foamfit.errors import InputError
@@ -35,8 +36,18 @@ noise = {{ stress = "35 kPa", displacement = "3.8 um" }}
 
 @pytest.fixture(scope="module")
 def soft():
-    """A fit of foam-1 hit too softly to close its loop, in 3 s."""
-    return ff.fit(ff.read_test(FOAM_1 / "model-2-1.75mps-reconstruction.csv"))
+    """A fit of foam-1 hit too softly to close its loop."""
+    return ff.fit(ff.read_test(FOAM_1 / "model-2-1.75mps-reconstruction.csv"), starts=4)
+
+
+def fewer(patch):
+    """Plan with a quarter of the draws and a third of the velocities, which take most of the time.
+
+    For tests in which neither changes what the plan says.
+    """
+    patch.setattr(plan_module, "DRAWS", 10)
+    patch.setattr(rigs, "VELOCITIES", 8)
+    patch.setattr(rigs, "STRAINS", 3)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +67,9 @@ def planned(soft, rig):
 @pytest.fixture(scope="module")
 def of_quantity(soft):
     """The plan for the peak force of a faster impact."""
-    return ff.plan(soft, quantity=QUANTITY)
+    with pytest.MonkeyPatch.context() as patch:
+        fewer(patch)
+        return ff.plan(soft, quantity=QUANTITY)
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +121,8 @@ def test_table_and_plot_show_each_test_and_each_parameter(planned):
     assert len(axes.get_legend().get_texts()) == 2
 
 
-def test_without_a_safe_test_none_is_advised(soft, tmp_path):
+def test_without_a_safe_test_none_is_advised(soft, tmp_path, monkeypatch):
+    fewer(monkeypatch)
     rig = tmp_path / "RIG.toml"
     rig.write_text(RIG.format(force=1), encoding="utf-8")
     found = ff.plan(soft, rig=rig)
@@ -162,7 +176,8 @@ def test_a_quantity_is_known_better_after_the_test_that_is_chosen_for_it(of_quan
     assert min(errors) <= found.advice.error
 
 
-def test_a_rival_law_is_told_apart_by_a_test_beyond_the_first(soft):
+def test_a_rival_law_is_told_apart_by_a_test_beyond_the_first(soft, monkeypatch):
+    fewer(monkeypatch)
     test = ff.read_test(FOAM_1 / "model-2-1.75mps-reconstruction.csv")
     quick = {"drive": "displacement", "starts": 1, "intervals": "local"}
     rival = ff.fit(test, model="microscale", **quick)
@@ -225,12 +240,11 @@ def test_the_same_law_with_relaxation_is_a_rival(monkeypatch):
 
 def test_files_and_terminal(soft, of_quantity, tmp_path, monkeypatch):
     """The same result and seed give the same plan, in the terminal as in Python."""
+    fewer(monkeypatch)  # as the plan in Python
     monkeypatch.chdir(tmp_path)
     soft.save("fits/foam/bistable", report=False)
     with monkeypatch.context() as early:
-        early.setattr(
-            plan_module, "plan", None
-        )  # the folder is refused before anything is computed
+        early.setattr(plan_module, "plan", None)  # refused before anything is computed
         told = run_refused("plan", "fits/foam/bistable", "--out", "fits/foam/bistable")
     assert "which does not belong to a plan" in told
     ran = run("plan", "fits/foam/bistable", "--for", QUANTITY)
@@ -284,8 +298,9 @@ def test_two_springs_with_a_camera_have_candidates_with_an_interior_displacement
     assert tomllib.loads(text)["specimen"]["height"] == "1.19 mm"
 
 
-def test_a_slow_test_is_followed_by_cycles_and_holds():
-    result = ff.fit(slow_test(), model="microscale", relaxation=1)
+def test_a_slow_test_is_followed_by_cycles_and_holds(monkeypatch):
+    fewer(monkeypatch)
+    result = ff.fit(slow_test(), model="microscale", relaxation=1, starts=4)
     found = ff.plan(result)
     kinds = {(one.candidate.drive, one.candidate.hold > 0.0) for one in found.outcomes}
     assert kinds == {("displacement", False), ("displacement", True)}
@@ -356,9 +371,10 @@ def test_what_the_rig_does_not_state_is_taken_from_the_record_and_said():
     assert len(rig.notes) == 5
 
 
-def test_where_the_law_errs_ranges_are_expected_and_no_test_removes_them(tmp_path):
+def test_where_the_law_errs_ranges_are_expected_and_no_test_removes_them(monkeypatch):
     """A microscale foam that is fitted by the bistable law: its kinks are not in the record."""
-    result = ff.fit(slow_test(), model="bistable")
+    fewer(monkeypatch)
+    result = ff.fit(slow_test(), model="bistable", starts=4)
     found = ff.plan(result)
     assert found.missed
     assert any("no test removes it" in sentence for sentence in found.sentences)
