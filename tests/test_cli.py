@@ -422,7 +422,6 @@ def test_refuses_calls_of_fit(here: Path, args: list[str], words: tuple[str, ...
         (["check", RECONSTRUCTION, "--specimen", "/dev/zero"], ("/dev/zero", "device")),
         (["compare", "/dev/zero"], ("/dev/zero", "device")),
         (["batch", "NOTHING"], ("NOTHING", "no such file", ".csv")),
-        (["fit", RECONSTRUCTION, "--model", "rubber"], ("model 'rubber'",)),
         (["simulate", "none.toml"], ("none.toml", "no such file")),
         (["compare", "none"], ("none is not a result folder",)),
     ],

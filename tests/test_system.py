@@ -1,35 +1,12 @@
-"""Signals and processes that also Windows has, tried here."""
+"""Processes as Windows starts them, tried here; for the end of the page see serving.py."""
 
 import multiprocessing
 import os
-import signal
-import subprocess
-import sys
 import time
-
-import pytest
 
 from foamfit import terminal
 from foamfit.page import worker
 from foamfit.study.processes import Processes, context_of
-
-PAGE = """
-from foamfit.page.server import serve
-serve(None, 0, browser=False)
-"""
-
-
-def test_the_page_ends_cleanly(tmp_path):
-    pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
-    process = subprocess.Popen(
-        [sys.executable, "-c", PAGE], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=os.environ | {"TMPDIR": str(tmp_path), "MPLBACKEND": "Agg"},
-    )  # fmt: skip
-    assert process.stdout.readline().startswith("http://127.0.0.1:")
-    process.send_signal(signal.SIGTERM)
-    _, errors = process.communicate(timeout=30)
-    assert process.returncode == 0, errors
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_processes_without_a_fork_server_are_spawned(monkeypatch):

@@ -43,12 +43,6 @@ def test_an_impact_is_recovered_within_three_standard_errors(impact_fit):
     assert impact_fit.visited == {"s1": ("a", "d", "c", "e")}
 
 
-def test_same_test_and_seed_give_the_same_numbers(impact_fit):
-    again = ff.fit(synthetic_impact(samples=201)[1], starts=4, seed=0)
-    assert again.params.valuesdict() == impact_fit.params.valuesdict()
-    assert again.statistics == impact_fit.statistics
-
-
 def test_a_loop_without_time_is_fitted_in_the_displacement_drive():
     spring, measurement = synthetic_loop()
     result = ff.fit(measurement)

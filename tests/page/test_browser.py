@@ -85,8 +85,6 @@ def rows(change=lambda i, row: row):
 BAD = {
     "word.csv": (rows(lambda i, r: "9,oops,1" if i == 9 else r), "row 11"),
     "no-unit.csv": (rows().replace("force (N)", "force"), "'force'"),
-    "constant.csv": (rows(lambda i, r: f"{i},5,{0.01 * i}"), "is constant"),
-    "back.csv": (rows(lambda i, r: "3,2.0,0.2" if i == 20 else r), "time goes back"),
     "picture.png": ("\x89PNG", "picture.png is not a table"),
 }
 

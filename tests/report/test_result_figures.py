@@ -1,27 +1,15 @@
-"""Figures of a result, and the imports of the command."""
+"""Real figures of a fit by the command, and what the command imports."""
 
 from __future__ import annotations
 
 import json
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
-import fabricated
 from conftest import EXPERIMENTS
-from foamfit.report.figures import images
-from foamfit.report.result_figures import figures_of
 
 RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
-
-
-def test_the_figure_of_a_fit_is_a_picture_and_has_text(tmp_path: Path) -> None:
-    folder = fabricated.result().save(tmp_path / "r")
-    assert (folder / "fit.png").read_bytes().startswith(b"\x89PNG")
-    assert (folder / "fit.pdf").read_bytes().startswith(b"%PDF")
-    (svg,) = images(figures_of(fabricated.result())["fit"], "svg")
-    assert b"stress (MPa)</text>" in svg
 
 
 def a_process(code: str, *arguments: str) -> tuple[str, set[str]]:
