@@ -31,6 +31,7 @@ from foamfit.solve import cache, precompile
 
 ROOT = Path(__file__).parent.parent
 EXPERIMENTS = ROOT / "experiments"
+RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 DATA = Path(os.environ.get("FOAMFIT_DATA", ROOT.parent / "shared" / "data"))
 
 # Records made by the studies, which share no code with foamfit.
@@ -39,6 +40,10 @@ STUDIES += ("other_laws", "")
 sys.path += [str(EXPERIMENTS / name) for name in STUDIES]
 gc.disable()  # imported modules and collected tests live until exit
 HEIGHT, AREA = 1.19e-3, 1.9635e-5
+NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
+SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
+STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
+HEADER = "time (ms),stress (MPa),displacement (mm)"
 os.environ["COLUMNS"] = "100"  # the same output width in every terminal
 
 needs_data = pytest.mark.skipif(

@@ -25,18 +25,11 @@ MICRO = MicroscaleSpring(
     k0=4.4e5, kc=4.9e5, eps_star=0.29, sigma_plus=1.06e5, spread_plus=0.44, sigma_minus=7.9e4,
     spread_minus=0.7, relaxation=[(0.5, 0.25)],
 )  # fmt: skip
-UNITS = {
-    "eps_a": "",
-    "eps_c": "",
-    "eps_star": "",
-    "spread_plus": "",
-    "spread_minus": "",
-    "g1": "",
-    "tau1": "s",
-    "height": "m",
-    "eta": "Pa·s",
-    "site_eta": "Pa·s",
-}
+UNITS = dict.fromkeys(("eps_a", "eps_c", "eps_star", "spread_plus", "spread_minus", "g1"), "")
+UNITS |= {"tau1": "s", "height": "m", "eta": "Pa·s", "site_eta": "Pa·s"}
+FILES = {  # of the folder of a fit with its report
+    "fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf", "table.tex",
+}  # fmt: skip
 
 
 def half_sine() -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[Switch, ...]]:
@@ -51,15 +44,11 @@ def half_sine() -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[Switch, ...]]
         ("e", "a"): back & (strain < SPRING.eps_hat_a),
     }
     places = {branches: int(np.argmax(found)) for branches, found in begins.items()}
-    return (
-        time,
-        strain,
-        stress,
-        tuple(
-            Switch(1, *branches, time[i], strain[i] * HEIGHT, stress[i])
-            for branches, i in places.items()
-        ),
+    switches = tuple(
+        Switch(1, *branches, time[i], strain[i] * HEIGHT, stress[i])
+        for branches, i in places.items()
     )
+    return time, strain, stress, switches
 
 
 def estimate(name: str, value: float, **changed: Any) -> ParameterEstimate:

@@ -14,20 +14,14 @@ import numpy as np
 import pytest
 from click.testing import Result
 
+import fabricated
 import foamfit as ff
-from conftest import EXPERIMENTS, run, run_refused, small_pictures
+from conftest import HEADER, RECONSTRUCTION, SPECIMEN, STRIKER, run, run_refused, small_pictures
 
-RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
-FILES = {
-    "fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf", "table.tex",
-}  # fmt: skip
 COMMANDS = (
     "batch", "check", "fit", "init", "simulate", "compare", "published", "joint", "predict"
 )  # fmt: skip
 
-SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
-STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
-HEADER = "time (ms),stress (MPa),displacement (mm)"
 LOOP = np.sin(np.linspace(0.0, np.pi, 41))
 ROWS = [f"{i},{2 * y:.6f},{4 * y:.6f}" for i, y in enumerate(LOOP)]
 
@@ -112,7 +106,7 @@ def test_fit_writes_beneath_the_current_directory(fitted: tuple[Path, Result]) -
     folder, result = fitted
     at = f"fits/{RECONSTRUCTION.stem}/bistable-seed-1-starts-4"
     profiled = "profile likelihood" in (folder / at / "parameters.csv").read_text()
-    names = FILES | {"budget.csv"} | ({"profiles.csv"} if profiled else set())
+    names = fabricated.FILES | {"budget.csv"} | ({"profiles.csv"} if profiled else set())
     assert set(files(folder)) == {f"{at}/{name}" for name in names}
     assert f"written to {at}" in result.stdout
     assert "s1_kh_minus" in result.stdout
@@ -147,7 +141,7 @@ def test_what_no_spring_follows_fails_and_is_written(
     result = run("fit", path, "--starts", 2, "--out", "out")
     assert result.exit_code == 2
     assert result.stderr == "foamfit: no acceptable fit was found; see out\n"
-    assert set(files(here / "out")) - {"profiles.csv"} == FILES
+    assert set(files(here / "out")) - {"profiles.csv"} == fabricated.FILES
     content = json.loads((here / "out" / "fit.json").read_text())
     assert content["status"] == "failed"
     assert any("not acceptable" in warning for warning in content["warnings"])

@@ -8,11 +8,10 @@ import matplotlib.pyplot as plt
 import pytest
 
 import foamfit as ff
-from conftest import ROOT
+from conftest import RECONSTRUCTION, ROOT
 from foamfit.cli import main
 from foamfit.springs import laws
 
-RECORD = ROOT / "experiments/foam-1/model-1-2.0mps-reconstruction.csv"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"```(\w*)\n(.*?)```", flags=re.DOTALL)
 
@@ -26,15 +25,15 @@ def blocks(page, *languages):
 @pytest.fixture(scope="module")
 def fitted():
     """The fit of the reconstruction that the pages use."""
-    return ff.fit(ff.read_test(RECORD), model="bistable")
+    return ff.fit(ff.read_test(RECONSTRUCTION), model="bistable")
 
 
 @pytest.fixture
 def place(tmp_path, monkeypatch, fitted):
     """A folder like that of a user, in which the same test is fitted only once."""
     (tmp_path / "experiments").symlink_to(ROOT / "experiments")
-    shutil.copy(RECORD, tmp_path / "TEST.csv")
-    shutil.copy(RECORD.with_suffix(".toml"), tmp_path / "TEST.toml")
+    shutil.copy(RECONSTRUCTION, tmp_path / "TEST.csv")
+    shutil.copy(RECONSTRUCTION.with_suffix(".toml"), tmp_path / "TEST.toml")
     shutil.copy(ROOT / "notebooks/bouc_wen.py", tmp_path)
     fitted.save(tmp_path / "fits/TEST/bistable", report=False)
     monkeypatch.chdir(tmp_path)

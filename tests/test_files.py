@@ -19,14 +19,13 @@ import foamfit.api
 import foamfit.report.figures
 import foamfit.report.folder
 import foamfit.results
-from conftest import EXPERIMENTS, run, run_refused, without_pictures
+from conftest import RECONSTRUCTION, run, run_refused, without_pictures
 from foamfit.errors import InputError
 from foamfit.files import check_file, csv_bytes, replacing, write_file
 from foamfit.report.folder import check_target, load_result
 from foamfit.report.listing import row_of, write_summary
 from foamfit.report.plots import plot_fit
 
-RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions of POSIX")
 
 

@@ -10,10 +10,8 @@ import pytest
 from click.testing import Result
 
 import fabricated
-from conftest import EXPERIMENTS, run, run_refused, without_pictures
+from conftest import RECONSTRUCTION, run, run_refused, without_pictures
 from foamfit import api
-
-RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 
 
 @pytest.fixture

@@ -12,14 +12,13 @@ from pathlib import Path
 import pytest
 
 import foamfit as ff
-from conftest import EXPERIMENTS, synthetic_impact, without_pictures
+from conftest import RECONSTRUCTION, synthetic_impact, without_pictures
 from foamfit import api
 from foamfit.cli import main
 from foamfit.cli import progress as module
 from foamfit.cli.progress import ProgressLine, progress_line
 
 pty = pytest.importorskip("pty")
-RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 
 
 class Terminal:

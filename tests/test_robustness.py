@@ -12,7 +12,7 @@ import pytest
 import foamfit as ff
 import foamfit.report.figures
 import foamfit.report.summary
-from conftest import AREA, HEIGHT, run, small_pictures, synthetic_impact, write_measurement
+from conftest import AREA, HEIGHT, NAMES, run, small_pictures, synthetic_impact, write_measurement
 from foamfit import one_model
 from foamfit.data.measurement import Measurement, Outliers
 from foamfit.fitting.curves import default_weights
@@ -24,7 +24,6 @@ from foamfit.report.summary import summary_text
 from foamfit.springs.model import Model
 
 BISTABLE = Model.parse("bistable")
-NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 
 
 def worst_deviation(result: ff.FitResult, spring: ff.BistableSpring) -> float:

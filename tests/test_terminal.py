@@ -17,13 +17,12 @@ import pytest
 from click.testing import CliRunner, Result
 
 import fabricated
-from conftest import EXPERIMENTS, small_pictures, without_pictures
+from conftest import RECONSTRUCTION, small_pictures, without_pictures
 from foamfit import api, terminal
 from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.terminal import ending_cleanly, printable
 
-RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 ODD = "foam \x1b[31mred\x1b[0m\x07\x9b2J\u202eback χ"
 
 

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from conftest import DATA, needs_data, refused, specimen_toml
+from conftest import DATA, HEADER, SPECIMEN, needs_data, refused, specimen_toml
 from foamfit.data.csv_file import read_test
 
-SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
 LOOP = np.sin(np.linspace(0, np.pi, 41))  # loading from 0 to 1 and unloading to 0
 
 
@@ -18,7 +17,7 @@ def numbers(separator=",", decimal="."):
     return [row.replace(".", decimal) for row in rows]
 
 
-def write(folder, header="time (ms),stress (MPa),displacement (mm)", rows=None, toml=SPECIMEN):
+def write(folder, header=HEADER, rows=None, toml=SPECIMEN):
     rows = numbers() if rows is None else rows
     path = folder / "test.csv"
     path.write_text("\n".join([*([header] if header else []), *rows]) + "\n", encoding="utf-8")
@@ -114,9 +113,6 @@ def test_a_mass_inside_is_read(tmp_path, header, scale):
 
 
 # Files that are rejected, with one sentence that names the error.
-
-
-HEADER = "time (ms),stress (MPa),displacement (mm)"
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ The records are synthetic: a force at 100 kHz and camera frames at 10 kHz.
 import numpy as np
 import pytest
 
-from conftest import refused
+from conftest import SPECIMEN, STRIKER, refused
 from foamfit.data.csv_file import read_test
 from foamfit.data.frames import Frames, join
 from foamfit.data.measurement import Record
@@ -15,8 +15,6 @@ from foamfit.study.batch_work import Recipe, fingerprint
 from foamfit.study.study_file import find_tests
 
 LAST = 4e-3  # s
-SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
-STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
 MOTION = '[motion]\nfile = "camera.csv"\n'
 
 

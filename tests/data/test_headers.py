@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import refused
+from conftest import SPECIMEN, refused
 from foamfit.data.csv_file import read_test
 
-SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
 T = np.linspace(0.0, 10.0, 201)
 W = 4.0 * np.sin(np.pi * T / 10.0)
 F = 50.0 * W

@@ -9,12 +9,10 @@ import sys
 import numpy as np
 import pytest
 
-from conftest import refused, run, run_refused
+from conftest import SPECIMEN, STRIKER, refused, run, run_refused
 from foamfit.data.csv_file import read_test
 
-SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
 COLUMNS = SPECIMEN + "[columns]\n"
-STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
 N = 161
 TIME = np.linspace(0, 30, N)  # s
 LOOP = np.sin(np.linspace(0, np.pi, N))

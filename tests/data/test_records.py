@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fabricated
-from conftest import refused, run
+from conftest import HEADER, SPECIMEN, STRIKER, refused, run
 from foamfit.data.calibration import contradictions
 from foamfit.data.csv_file import read_test
 from foamfit.data.energy import audit
@@ -15,10 +15,6 @@ from foamfit.errors import InputError
 from foamfit.fitting.curves import check_drive
 from foamfit.report.described import describe
 from foamfit.report.summary import render_report, summary_text
-
-SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
-STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
-HEADER = "time (ms),stress (MPa),displacement (mm)"
 
 
 def write(folder, lines, toml=SPECIMEN):

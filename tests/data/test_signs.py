@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 
 import fabricated
-from conftest import DATA, needs_data, refused, run, specimen_toml, write_csv
+from conftest import DATA, SPECIMEN, needs_data, refused, run, specimen_toml, write_csv
 from foamfit.data.csv_file import read_test
 from foamfit.data.measurement import Measurement
 from foamfit.report.summary import summary_text
 
-SPECIMEN = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
 STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "4 m/s"\n'
 COMBINATIONS = [(1, -1), (-1, 1), (-1, -1)]  # signs of force and motion
 

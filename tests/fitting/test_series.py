@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import loop_measurement
+from conftest import NAMES, loop_measurement
 from foamfit.data.measurement import Specimen
 from foamfit.springs.model import Model, exchanges
 
@@ -64,10 +64,9 @@ def test_intervals_of_two_springs_hold_the_truth():
     assert base.sigma_a < 0.7 * top.sigma_a
     assert result.curves.interior == {}
     assert "displacement_1_time" not in result.misfit
-    names = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
     held = []
     for number, spring in ((1, SOFT), (2, STIFF)):
-        for name, true in zip(names, spring.seven, strict=True):
+        for name, true in zip(NAMES, spring.seven, strict=True):
             item = result.parameters[f"s{number}_{name}"]
             if item.ci95 is not None:
                 held.append(item.ci95[0] <= true <= item.ci95[1])

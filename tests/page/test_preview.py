@@ -61,14 +61,14 @@ def test_a_fit_offers_its_card_and_the_plan_of_the_next_test(tmp_path):
     import zipfile
 
     import foamfit as ff
-    from conftest import EXPERIMENTS
+    from conftest import RECONSTRUCTION
     from foamfit.page.desk import Desk
 
     class Fitted(Desk):
         fits = {0: tmp_path / "fit"}  # noqa: RUF012
 
     desk = Fitted(tmp_path / "window")
-    test = ff.read_test(EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv")
+    test = ff.read_test(RECONSTRUCTION)
     ff.fit(test, starts=2, intervals="local").save(tmp_path / "fit", report=False)
     names = zipfile.ZipFile(io.BytesIO(desk.card(0))).namelist()
     assert {"foam.k", "foam.k.json"} <= set(names)

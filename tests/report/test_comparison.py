@@ -13,7 +13,7 @@ import pytest
 
 import fabricated
 import foamfit as ff
-from conftest import run
+from conftest import NAMES, run
 from foamfit.api import FitResult
 from foamfit.errors import InputError
 from foamfit.report.comparison import (
@@ -27,8 +27,6 @@ from foamfit.report.comparison import (
 )
 from foamfit.results import Correlation
 from foamfit.springs import laws
-
-NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 
 
 def published_fit(

@@ -18,9 +18,6 @@ from conftest import small_pictures
 from foamfit.errors import InputError
 from foamfit.report.folder import load_result
 
-FILES = {
-    "fit.json", "parameters.csv", "curves.csv", "report.html", "fit.png", "fit.pdf", "table.tex",
-}  # fmt: skip
 KEYS = {
     "schema", "foamfit", "test", "data_sha256", "model", "drive", "interior_mass", "seed",
     "status", "warnings",
@@ -55,7 +52,7 @@ def strict(text: str) -> dict:
 
 
 def test_folder_is_complete_and_nothing_is_beside_it(saved: Path) -> None:
-    assert {path.name for path in saved.iterdir()} == FILES
+    assert {path.name for path in saved.iterdir()} == fabricated.FILES
     assert [path.name for path in saved.parent.iterdir()] == ["bistable"]
     assert (saved / "fit.png").read_bytes().startswith(b"\x89PNG")
     assert (saved / "fit.pdf").read_bytes().startswith(b"%PDF")
@@ -137,7 +134,7 @@ def test_failing_midway_leaves_the_older_result(
     with pytest.raises(failure):
         fabricated.result(seed=2).save(tmp_path / "new" / "deep")
     assert load_result(folder)["seed"] == 1
-    assert {path.name for path in folder.iterdir()} == FILES
+    assert {path.name for path in folder.iterdir()} == fabricated.FILES
     assert [path.name for path in tmp_path.iterdir()] == ["r"]
 
 
@@ -169,7 +166,9 @@ def test_loading_what_is_no_result(tmp_path: Path, text: str | None, complaint: 
 
 def test_the_same_result_gives_the_same_files(saved: Path, tmp_path: Path) -> None:
     again = fabricated.result().save(tmp_path / "again")
-    assert all((again / name).read_bytes() == (saved / name).read_bytes() for name in FILES)
+    assert all(
+        (again / name).read_bytes() == (saved / name).read_bytes() for name in fabricated.FILES
+    )
 
 
 def test_derived_numbers_of_a_microscale_spring() -> None:

@@ -17,13 +17,12 @@ import pytest
 from numba.core.caching import _CacheLocator
 
 import fabricated
-from conftest import EXPERIMENTS, run, without_pictures
+from conftest import RECONSTRUCTION, run, without_pictures
 from foamfit import api
 from foamfit.solve import cache, precompile
 from foamfit.solve.compiled import loop
 from foamfit.springs.compiled import bistable, stale
 
-RECONSTRUCTION = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 # Reads a test, compiles for a model, fits, and prints what the fit compiled
 # or read from the cache besides.
 FIT = """

@@ -17,7 +17,14 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 import foamfit as ff
-from conftest import EXPERIMENTS, correlated, loop_measurement, run, run_refused, synthetic_impact
+from conftest import (
+    RECONSTRUCTION,
+    correlated,
+    loop_measurement,
+    run,
+    run_refused,
+    synthetic_impact,
+)
 from foamfit.data.measurement import Specimen, Striker
 from foamfit.errors import InputError
 from foamfit.fitting.problem import Problem, make_params, make_problem
@@ -409,8 +416,7 @@ def test_the_result_says_what_made_each_interval(tmp_path: Path, monkeypatch):
 
 
 def test_the_command_makes_intervals_one_way_and_tells_the_cost(tmp_path: Path):
-    test = EXPERIMENTS / "foam-1" / "model-1-2.0mps-reconstruction.csv"
-    call = ["fit", str(test), "--starts", "2", "--out", str(tmp_path / "out")]
+    call = ["fit", str(RECONSTRUCTION), "--starts", "2", "--out", str(tmp_path / "out")]
     told = run_refused(*call, "--profile", "--mcmc", "200")
     assert "--profile and --mcmc exclude each other" in told
     assert not (tmp_path / "out").exists()

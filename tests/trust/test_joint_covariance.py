@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from conftest import HEIGHT, synthetic_loop
+from conftest import HEIGHT, NAMES, synthetic_loop
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
 from foamfit.fitting.together import fit_linked
@@ -14,7 +14,6 @@ from foamfit.trust.best_point import BestPoint, JointPoint
 
 SPRING, WHOLE = synthetic_loop(noise=0.0)
 LOOP = replace(WHOLE, displacement=WHOLE.displacement[::2], stress=WHOLE.stress[::2])
-NAMES = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
 X = np.log([0.1, 1.0, 10.0])
 
 
