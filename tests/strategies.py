@@ -1,10 +1,18 @@
-"""Random springs and histories for property tests."""
+"""Springs by the ratios of the paper, and random springs and histories for property tests."""
 
 import numpy as np
 from hypothesis import strategies as st
 
 import foamfit as ff
 from reference import law
+
+
+def with_ratios(
+    k0: float, ratio: float, eps_a: float, eps_c: float, plus: float, minus: float, kc: float
+) -> ff.BistableSpring:
+    """Return a spring; `ratio` is Δσ/σ_a, and the three others are stiffnesses over k0."""
+    dsigma = ratio * k0 * eps_a / (1 - eps_a)
+    return ff.BistableSpring(k0, kc * k0, dsigma, eps_a, eps_c, plus * k0, minus * k0)
 
 
 @st.composite

@@ -13,26 +13,20 @@ from foamfit import Chain
 from foamfit import LinearSpring as Linear
 from independent import Truth, follow
 from reference import law
+from strategies import with_ratios
 
 AREA = np.pi * 2.5e-3**2
-
-
-def bistable(
-    k0: float, ratio: float, eps_a: float, eps_c: float, plus: float, minus: float, kc: float
-) -> ff.BistableSpring:
-    dsigma = ratio * k0 * eps_a / (1 - eps_a)
-    return ff.BistableSpring(k0, kc * k0, dsigma, eps_a, eps_c, plus * k0, minus * k0)
 
 
 def damped(spring: Any, eta: float) -> Any:
     return dataclasses.replace(spring, eta=eta)
 
 
-MODEL_1 = bistable(5.5e6, -0.20, 0.14, 0.31, 2.6, 0.450, 15)
-MODEL_2 = bistable(5.5e6, -0.20, 0.14, 0.31, 2.6, 0.425, 15)
-BASE_3, TOP_3 = Linear(60e6), bistable(2e6, -0.32, 0.35, 0.71, 3.4, 0.525, 30)
+MODEL_1 = with_ratios(5.5e6, -0.20, 0.14, 0.31, 2.6, 0.450, 15)
+MODEL_2 = with_ratios(5.5e6, -0.20, 0.14, 0.31, 2.6, 0.425, 15)
+BASE_3, TOP_3 = Linear(60e6), with_ratios(2e6, -0.32, 0.35, 0.71, 3.4, 0.525, 30)
 BASE_2 = Linear(250e6, unilateral=True)
-TOP_2 = bistable(5.75e6, -0.80, 0.40, 0.70, 6.0, 0.2, 40)
+TOP_2 = with_ratios(5.75e6, -0.80, 0.40, 0.70, 6.0, 0.2, 40)
 ONE, THREE, TWO = (1.190e-3,), (0.700e-3, 0.490e-3), (0.350e-3, 0.756e-3)
 SMALL_1, SMALL_2 = (5.56e-6, 0.0), (5.05e-6, 0.0)
 FOAM_1, FOAM_2 = ff.Impact(7e-3, 1.75), ff.Impact(7e-3, 4.44)
@@ -341,22 +335,17 @@ def test_inadmissible_drives_are_refused_by_name(make: object, name: str) -> Non
         ff.simulate(SCENE, make(), GOOD)  # type: ignore[operator]
 
 
+INADMISSIBLE: dict[str, list[Any]] = {
+    "springs": [[]], "heights": [[1e-3], [1e-3, 0.0], [1e-3, -1e-3], [1e-3, math.nan]],
+    "area": [0.0, -1.0, math.nan], "masses": [[0.0], [-1e-6, 0.0], [math.nan, 0.0]],
+    "site_damping": [-1.0, math.nan],
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("change", "name"),
     [
-        ({"springs": []}, "springs"),
-        ({"heights": [1e-3]}, "heights"),
-        ({"heights": [1e-3, 0.0]}, "heights"),
-        ({"heights": [1e-3, -1e-3]}, "heights"),
-        ({"heights": [1e-3, math.nan]}, "heights"),
-        ({"area": 0.0}, "area"),
-        ({"area": -1.0}, "area"),
-        ({"area": math.nan}, "area"),
-        ({"masses": [0.0]}, "masses"),
-        ({"masses": [-1e-6, 0.0]}, "masses"),
-        ({"masses": [math.nan, 0.0]}, "masses"),
-        ({"site_damping": -1.0}, "site_damping"),
-        ({"site_damping": math.nan}, "site_damping"),
+        *(({name: value}, name) for name, values in INADMISSIBLE.items() for value in values),
         ({"springs": None}, "springs = None"),
         ({"springs": SCENE.springs[0]}, "springs = LinearSpring"),
         ({"springs": [SCENE.springs[0], 60e6]}, "springs: spring 2 is a float"),
