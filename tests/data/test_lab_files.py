@@ -410,10 +410,7 @@ def test_strains_that_cannot_be_are_refused(tmp_path):
 def test_a_true_stress_is_refused_or_left_for_the_force(tmp_path, name):
     path = strained(tmp_path, f"{name},strain", STRAIN)
     refused(path, repr(name), "true (Cauchy) stress", "nominal (engineering) stress")
-    lines = [
-        f"time (s),{name},force (N),strain",
-        *rows(TIME, FORCE / 60, FORCE, STRAIN),
-    ]
+    lines = [f"time (s),{name},force (N),strain", *rows(TIME, FORCE / 60, FORCE, STRAIN)]
     test = read_test(write(tmp_path, lines))
     expect(test)
     assert repr(name) in test.notes[0].partition("not used")[2]

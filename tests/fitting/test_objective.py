@@ -10,11 +10,7 @@ import pytest
 import foamfit as ff
 from conftest import synthetic_impact, synthetic_loop
 from foamfit.data.measurement import Measurement, Noise, Outliers
-from foamfit.fitting.curves import (
-    check_drive,
-    choose_drive,
-    default_weights,
-)
+from foamfit.fitting.curves import check_drive, choose_drive, default_weights
 from foamfit.fitting.objective import Objective
 from foamfit.one_model import Options
 from foamfit.springs.model import Model

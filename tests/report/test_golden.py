@@ -1,6 +1,6 @@
 """Exact output of the commands: one file for each case in tests/golden.
 
-    FOAMFIT_RENEW_GOLDEN=1 pytest tests/test_golden.py
+    FOAMFIT_RENEW_GOLDEN=1 pytest tests/report/test_golden.py
 
 rewrites the files; check the changes with `git diff tests/golden` before committing them.
 The results are fabricated, so that no number depends on a search or on the machine.

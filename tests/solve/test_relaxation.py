@@ -47,12 +47,7 @@ TURNS = (0.0, 0.5, 0.2, 0.4, 0.05, 0.6, -0.02, 0.3)
 @pytest.mark.parametrize("own", LAWS.values(), ids=LAWS)
 @pytest.mark.parametrize(
     ("terms", "samples"),
-    [
-        ([(0.5, 0.2)], 4),
-        ([(0.5, 0.2)], 40),
-        ([(0.5, 1e-2), (1.0, 1e4)], 4),
-        ([(0.7, 1e-4)], 4),
-    ],
+    [([(0.5, 0.2)], 4), ([(0.5, 0.2)], 40), ([(0.5, 1e-2), (1.0, 1e4)], 4), ([(0.7, 1e-4)], 4)],
     ids=["one, coarse", "one, fine", "fast and slow", "very fast"],
 )
 def test_stress_is_within_rtol(own: tuple[float, ...], terms: Terms, samples: int) -> None:

@@ -11,14 +11,7 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import (
-    AREA,
-    HEIGHT,
-    loop_measurement,
-    synthetic_impact,
-    synthetic_loop,
-    write_csv,
-)
+from conftest import AREA, HEIGHT, loop_measurement, synthetic_impact, synthetic_loop, write_csv
 from foamfit.data.measurement import Measurement, Specimen
 from foamfit.fitting.problem import make_problem
 from foamfit.trust.best_point import BestPoint

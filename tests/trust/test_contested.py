@@ -43,10 +43,7 @@ def far(result: ff.FitResult, truth: dict[str, float]) -> list[str]:
 
 @pytest.mark.parametrize(
     ("wrong", "word"),
-    [
-        ({"velocity": 0.9}, "velocity is given as"),
-        ({"mass": 1.15}, "impulse of the force is 0.8"),
-    ],
+    [({"velocity": 0.9}, "velocity is given as"), ({"mass": 1.15}, "impulse of the force is 0.8")],
 )
 def test_a_contradicted_impact_is_driven_by_its_motion(
     wrong: dict[str, float], word: str, tmp_path: Path

@@ -24,12 +24,7 @@ from foamfit.one_model import Options, identify, judge
 from foamfit.report.folder import load_result
 from foamfit.report.readable import readable
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import (
-    RULE,
-    Block,
-    Uncertainty,
-    covariance,
-)
+from foamfit.trust.covariance import RULE, Block, Uncertainty, covariance
 from foamfit.trust.profile import Refit
 from foamfit.trust.ranges import ALIKE, alike, left_open, tolerance
 from foamfit.trust.residuals.law_error import curve_errors
