@@ -12,14 +12,13 @@ from foamfit.solve.compiled.motion import (
     rates,
     rates_of,
 )
-from foamfit.solve.compiled.run import numbers, spring, unpack
+from foamfit.solve.compiled.run import numbers, spring, sum_gain, unpack
 from foamfit.solve.compiled.samples import KNOWN, row_of, write
 from foamfit.solve.compiled.static import bring, push_to, strain_to
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled.contract import (
     BY_STRESS,
     INTERNAL,
-    RELAX,
     WHOLE,
     WHOLES_AT,
     inner,
@@ -86,9 +85,7 @@ def _start(c):  # type: ignore[no-untyped-def]
     if c.p > 0:
         _derive_start(c, g, i0, i1, first)
     for i in range(i0, i1):
-        s = spring(c, i)
-        for k in range(c.terms):
-            s.gain += s[RELAX + 2 * k]
+        sum_gain(c, i)
 
 
 @inner
@@ -105,11 +102,7 @@ def _derive_start(c, g, i0, i1, common):  # type: ignore[no-untyped-def]
         s.eta = 0.0 if c.top == MOTION else s.eta
     rates_of(c, g, y, c.f, ONLY_DERIVATIVES, 0.0)
     for i in range(i0, i1):
-        s, n, strain = (
-            spring(c, i),
-            numbers(c, i),
-            past(c.strain, i * p),
-        )
+        s, n, strain = spring(c, i), numbers(c, i), past(c.strain, i * p)
         s.eta, s.offset = s.offset, 0.0
         slope, part, at = s.slope, past(c.part, i * p), base + n.eps_at * p
         if s.eta > 0.0 and n.eps_at >= 0:

@@ -32,7 +32,7 @@ from foamfit.solve.compiled.motion import (
     in_contact,
     rates,
 )
-from foamfit.solve.compiled.run import numbers, spring, unpack
+from foamfit.solve.compiled.run import numbers, spring, sum_gain, unpack
 from foamfit.solve.scene import MOTION, VISCOUS
 from foamfit.springs.compiled.contract import (
     ALONG_A,
@@ -326,10 +326,10 @@ def _end_ramp(c, want):  # type: ignore[no-untyped-def]
         strain, part = past(c.strain, i * p), past(c.part, i * p)
         for k in range(terms):
             s[RELAX + 2 * k] = kept[1 + k]
-            s.gain += kept[1 + k]
             y[n.z_at + k] = -s.sigma
             for j in range(p):
                 y[c.base + (n.z_at + k) * p + j] = -(s.steep * strain[j] + part[j])
+        sum_gain(c, i)
         if kept[0] == 0.0:
             continue
         s.eta = s.loss = kept[0]

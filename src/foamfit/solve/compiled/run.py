@@ -201,6 +201,15 @@ def numbers(c, i):  # type: ignore[no-untyped-def]
 
 
 @inner
+def sum_gain(c, i):  # type: ignore[no-untyped-def]
+    """Fill the gain 1 + Σ g of a spring."""
+    s = spring(c, i)
+    s.gain = 1.0
+    for k in range(c.terms):
+        s.gain += s[RELAX + 2 * k]
+
+
+@inner
 def begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals):  # type: ignore[no-untyped-def]
     """Fill the record of a run, set all springs at rest, and return the record.
 
@@ -219,11 +228,11 @@ def begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals):
     given, tall, heavy, settings = start(rows), start(heights), start(mass), start(reals)
     for i in range(c.count):
         s, n, height = spring(c, i), numbers(c, i), tall[i]
-        s.height, s.per_height, s.gain = height, 1.0 / height, 1.0
+        s.height, s.per_height = height, 1.0 / height
         s.eta, s.loss = given[0], given[0]
         for k in range(c.terms):
             s[RELAX + 2 * k], s[RELAX + 2 * k + 1] = given[1 + 2 * k], given[2 + 2 * k]
-            s.gain += given[1 + 2 * k]
+        sum_gain(c, i)
         row = past(s, c.row)
         for k in range(own, width):
             row[k - own] = given[k]

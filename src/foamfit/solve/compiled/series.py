@@ -16,7 +16,7 @@ from foamfit.solve.compiled.along import OF_STEP, TABLE, tabulate
 from foamfit.solve.compiled.events import MIDDLE, suspicious
 from foamfit.solve.compiled.explicit import SHORTENING
 from foamfit.solve.compiled.motion import ONLY_DERIVATIVES, evaluate, rates, rates_of
-from foamfit.solve.compiled.run import STEPPED, numbers, spring, unpack
+from foamfit.solve.compiled.run import STEPPED, numbers, spring, sum_gain, unpack
 from foamfit.solve.compiled.static import strain_at
 from foamfit.solve.scene import STRESS
 from foamfit.springs.compiled.contract import RELAX, inner, past, pointed
@@ -87,10 +87,8 @@ def _prepare(c, h):  # type: ignore[no-untyped-def]
 def _restore(c):  # type: ignore[no-untyped-def]
     """Give the springs back their own gains."""
     for i in range(c.count):
-        s = spring(c, i)
-        s.gain, s.offset = 1.0, 0.0
-        for k in range(c.terms):
-            s.gain += s[RELAX + 2 * k]
+        spring(c, i).offset = 0.0
+        sum_gain(c, i)
 
 
 @inner
