@@ -14,7 +14,7 @@ from foamfit.solve.compiled.motion import (
 )
 from foamfit.solve.compiled.run import numbers, spring, sum_gain, unpack
 from foamfit.solve.compiled.samples import KNOWN, row_of, write
-from foamfit.solve.compiled.static import bring, push_to, strain_to
+from foamfit.solve.compiled.static import bring, push_to
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled.contract import (
     BY_STRESS,
@@ -68,8 +68,6 @@ def _start(c):  # type: ignore[no-untyped-def]
         for i in range(i0, i1):
             if spring(c, i).eta == 0.0:
                 push_to(c, i, first, 0.0, y)
-    elif i1 - i0 == 1:
-        strain_to(c, i0, first / spring(c, i0).height, y)
     else:
         first = bring(c, i0, i1, first, 0.0, y)
     for i in range(i0, i1):

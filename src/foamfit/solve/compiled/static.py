@@ -122,21 +122,6 @@ def push_to(c, i, sigma, before, y):  # type: ignore[no-untyped-def]
 
 
 @inner
-def strain_to(c, i, eps, y):  # type: ignore[no-untyped-def]
-    """Bring a spring to a strain."""
-    s, n = spring(c, i), numbers(c, i)
-    for _ in range(MOST_SWITCHES):
-        up = eps > s.eps
-        if eps != s.eps and s.turns * (1.0 if up else -1.0) < 0.0:
-            change_branch(c, i, int(up), y)
-        elif eps > s.high or eps < s.low:
-            change_branch(c, i, int(eps > s.high), y)
-        else:
-            break
-    call_number(n.settle, past(s, c.row), s, eps)
-
-
-@inner
 def elongation(c, i0, i1):  # type: ignore[no-untyped-def]
     """Return the elongation of springs at their present strains."""
     total = 0.0
