@@ -80,7 +80,7 @@ def _put(c, node, k, value, slopes):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _write(c, y, at, k, want):  # type: ignore[no-untyped-def]
+def write_sample(c, y, at, k, want):  # type: ignore[no-untyped-def]
     """Write sample k from a state at a time since the piece began.
 
     The values of all springs are KNOWN or computed, with derivatives if they are wanted.
@@ -99,7 +99,8 @@ def _write(c, y, at, k, want):  # type: ignore[no-untyped-def]
             place = place_nodes(c, g, y, reach)
             for i in range(c.ends[g - 1] if g > 0 else c.none, c.ends[g]):
                 place += _rise(c, i, reach)
-                _put(c, 1 + i if every else top, k, place, reach)
+                if every or i == c.count - 1:
+                    _put(c, 1 + i if every else top, k, place, reach)
         if solved:
             _put(c, top, k, y[2 * g], past(y, c.base + 2 * g * p))
         elif c.top == MOTION:
@@ -211,7 +212,7 @@ def _write_inside(c, reached, want):  # type: ignore[no-untyped-def]
             k = last
     while k < c.samples and t[k] <= reached:
         dense(c, n, (t[k] - r.now) / r.step, c.state)
-        _write(c, c.state, t[k], k, want)
+        write_sample(c, c.state, t[k], k, want)
         k += 1
     r.sample = k
 
@@ -293,7 +294,7 @@ def sample_task(words, y, at, k, want):  # type: ignore[no-untyped-def]
     elif k == APPROACH:
         _approach(c, at)
     else:
-        _write(c, y, at, k, want)
+        write_sample(c, y, at, k, want)
 
 
 _call_samples = calling(types.void, RECORD, REALS_AT, REAL, WHOLE, WHOLE)

@@ -12,7 +12,7 @@ import math
 from foamfit.solve.compiled.events import change_branch
 from foamfit.solve.compiled.motion import ONLY_DERIVATIVES, evaluate, in_contact, rates_of
 from foamfit.solve.compiled.run import begin_run, numbers, spring
-from foamfit.solve.compiled.samples import is_finite, row_of
+from foamfit.solve.compiled.samples import KNOWN, is_finite, write_sample
 from foamfit.solve.scene import MOTION, STRESS
 from foamfit.springs.compiled.contract import BY_STRESS, call_number, inner, outer, past
 
@@ -205,27 +205,14 @@ def _bring_all(c, k, before):  # type: ignore[no-untyped-def]
 @inner
 def _write(c, k, now):  # type: ignore[no-untyped-def]
     """Write sample k: the common stress, displacements, and their derivatives."""
-    p, place, reach = c.p, 0.0, past(c.common, 3 * c.p)  # with one group, the last of the rows
-    if p > 0:
+    c.carried[0], c.drive.value, c.drive.shift = now, c.values[k], in_contact(c, k)
+    if c.p > 0:
         for i in range(c.count):
             s = spring(c, i)
             evaluate(c, i, 1 + c.none)
             s.tangent, s.total = s.slope, s.sigma
-        c.carried[0], c.drive.shift = now, in_contact(c, k)
         rates_of(c, c.none, c.y, c.f, ONLY_DERIVATIVES, 0.0)
-    row_of(c, c.none, c.none)[k] = now
-    for j in range(p):
-        row_of(c, 1 + j, c.none)[k], reach[j] = c.common[j], 0.0
-    for i in range(c.count):
-        s, strain, own = spring(c, i), past(c.strain, i * p), past(c.own, 2 * i * p)
-        place += s.height * s.eps
-        for j in range(p):
-            reach[j] += s.height * strain[j] + s.eps * own[j]
-        if c.shown > 2 or i == c.count - 1:
-            node = 1 + i if c.shown > 2 else c.shown - 1
-            row_of(c, c.none, node)[k] = place
-            for j in range(p):
-                row_of(c, 1 + j, node)[k] = reach[j]
+    write_sample(c, c.y, 0.0, k, KNOWN + c.none)
 
 
 @outer
@@ -238,7 +225,7 @@ def balance(  # type: ignore[no-untyped-def]
     elongation, infinite if a sample is not finite.
     """
     c = begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals)
-    before = 0.0
+    before = miss = 0.0
     for i in range(c.count):
         evaluate(c, i, int(c.p > 0))
     for k in range(c.samples):
@@ -247,8 +234,6 @@ def balance(  # type: ignore[no-untyped-def]
         for i in range(c.count):
             s = spring(c, i)
             history[0, i, k], history[1, i, k] = s.eps, s.branch
-    miss, top = 0.0 if is_finite(c, c.shown) else math.inf, row_of(c, c.none, c.shown - 1)
-    for k in range(c.samples if c.top == MOTION else c.none):
-        miss = max(miss, abs(top[k] - c.values[k]))
-        top[k] = c.values[k]
-    return miss
+        if c.top == MOTION:
+            miss = max(miss, abs(elongation(c, c.none, c.count) - c.values[k]))
+    return miss if is_finite(c, c.shown) else math.inf
