@@ -42,15 +42,7 @@ TOP_END, LOW_END, TURN, RELEASE, TOP_TURN, LOW_TURN = range(6)
 PLAIN, SAMPLED, DOUBTFUL, FAILED = range(4)  # ends of an attempted step
 #: record, whether with derivatives, tolerance, time of the next sample, bound on steps
 STEPPING = WHOLE(WHOLES_AT, WHOLE, REAL, REAL, REAL)
-
-
-_call_step = calling(WHOLE, RECORD, WHOLE, REAL, REAL, REAL)
-
-
-@inlined
-def take_step(c, want, tol, upto, most):  # type: ignore[no-untyped-def]
-    """Take one step, explicit or implicit; return how it ended."""
-    return _call_step(c.step_at, c, want, tol, upto, most)
+call_step = calling(WHOLE, RECORD, WHOLE, REAL, REAL, REAL)
 
 
 @pointed(types.void(WHOLES_AT, WHOLE, WHOLE, REALS_AT))
@@ -170,11 +162,8 @@ def _earliest(c, before, share):  # type: ignore[no-untyped-def]
     found, who, what = share, -1 + c.none, -1 + c.none
     look(c, found)
     if c.now.pressed > 0.0 and c.carried[0] <= 0.0:
-        found, who, what = (
-            _locate(c, before, found, c.none, RELEASE + c.none),
-            c.none,
-            RELEASE + c.none,
-        )
+        who, what = c.none, RELEASE + c.none
+        found = _locate(c, before, found, who, what)
         look(c, found)
     for i in range(c.count):
         for kind in range(RELEASE):

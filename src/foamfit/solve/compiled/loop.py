@@ -14,10 +14,10 @@ from foamfit.solve.compiled.events import (
     ROUNDED,
     TOP_END,
     TURN,
+    call_step,
     change_branch,
     first_event,
     keep_values,
-    take_step,
 )
 from foamfit.solve.compiled.motion import dense, look, rates
 from foamfit.solve.compiled.run import (
@@ -50,7 +50,6 @@ from foamfit.springs.compiled.contract import (
     WHOLE,
     WHOLES_AT,
     calling,
-    inlined,
     inner,
     outer,
     past,
@@ -77,14 +76,7 @@ ENDINGS = 10
 LEAST_SHARE = 1e-6  # of the largest scale of nodes, see `_fresh_scales`
 SWITCHED, RELEASED, STALLED = 1, 2, 3  # what happened in a step
 
-
-_call_drive = calling(WHOLE, RECORD, WHOLE, WHOLE)
-
-
-@inlined
-def drive(c, starts, want):  # type: ignore[no-untyped-def]
-    """Start from rest, or begin the next piece; return whether all samples are written."""
-    return _call_drive(c.drive_at, c, starts, want)
+_call_drive = calling(WHOLE, RECORD, WHOLE, WHOLE)  #: `drive.next_piece`
 
 
 @inner
@@ -367,7 +359,7 @@ def integrate(  # type: ignore[no-untyped-def]
             top = 2 * c.groups - 1
             r.step = min(r.step, STOPPED * abs(c.y[top] / c.stage[top]))
     else:
-        done = drive(c, 1, want)
+        done = _call_drive(c.drive_at, c, 1, want)
         r.step = r.horizon
     outcome, ended, longest = DONE, math.nan, _longest(c, want)
     gives_up = given[FOLLOWED] > 0.0 and not struck
@@ -376,7 +368,7 @@ def integrate(  # type: ignore[no-untyped-def]
         keep_values(c)
         r.step = min(r.step, r.horizon - r.now, longest)
         upto = c.time[int(r.sample)] if struck else math.inf
-        how = take_step(c, want, tol, upto, most)
+        how = call_step(c.step_at, c, want, tol, upto, most)
         outcome = _failure(c, how, most, gives_up)
         event = _call_advance(c.advance_at, c, how, struck, want) if outcome == DONE else c.none
         stalled = stalled + 1 if event == STALLED else 0
@@ -389,7 +381,7 @@ def integrate(  # type: ignore[no-untyped-def]
         if r.now >= r.horizon and struck:
             r.horizon = math.nextafter(r.now, math.inf)
         elif r.now >= r.horizon:
-            done = drive(c, c.none, want)
+            done = _call_drive(c.drive_at, c, 0, want)
             _turn(c, want, -1 + c.none)
         r.step = dt
     told[OUTCOME], told[ENDED] = outcome, ended
