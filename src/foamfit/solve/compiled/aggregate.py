@@ -46,11 +46,9 @@ from foamfit.springs.compiled.contract import (
     beginning,
     evaluating,
     inner,
-    inverting,
     outer,
     past,
     pointing,
-    settling,
     switching,
 )
 from foamfit.springs.laws.record import Law
@@ -226,17 +224,6 @@ def _switch(row, s, up, out):  # type: ignore[no-untyped-def]
     return 0.0
 
 
-@settling
-def _settle(row, s, eps):  # type: ignore[no-untyped-def]
-    return math.nan  # explicit steps alone follow an aggregate, and integrate its stress
-
-
-@inverting
-def _inverse(row, s, sigma):  # type: ignore[no-untyped-def]
-    strain, s.soft = _at(as_row(row), sigma)
-    return strain
-
-
 @outer
 def _place(shapes, heights, branches, log, time, stress, free, nodes):  # type: ignore[no-untyped-def]
     """Fill the displacements above all springs but the last, whose displacement is known.
@@ -319,8 +306,7 @@ def _leaves(count: int) -> int:
 def law_of(count: int) -> tuple[Law, Compiled]:
     """Return the law of an aggregate of so many springs."""
     columns = SPRINGS + count * OF_SPRING + 4 * _leaves(count) + 5 * MOST_SWITCHES * count
-    addresses = (
-        _begin.address, _evaluate.address, _switch.address, _settle.address, _inverse.address
-    )  # fmt: skip
+    # Explicit steps integrate its stress, so that `settle` and `strain` are not called.
+    addresses = _begin.address, _evaluate.address, _switch.address, 0, 0
     made = Compiled(None, BY_STRESS, columns, 0, 1, addresses)
     return Law("aggregate", (), made), made

@@ -15,6 +15,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from foamfit.springs.compiled.bistable import settle
 from foamfit.springs.compiled.contract import (
     ALONG_A,
     ALONG_B,
@@ -52,7 +53,6 @@ from foamfit.springs.compiled.contract import (
     last_point,
     outer,
     past,
-    settling,
     start,
     switching,
 )
@@ -288,12 +288,6 @@ def _switch(row, s, up, out):  # type: ignore[no-untyped-def]
     return 0.0
 
 
-@settling
-def _settle(row, s, eps):  # type: ignore[no-untyped-def]
-    s.eps = eps
-    return 0.0
-
-
 @inverting
 def _strain(row, s, sigma):  # type: ignore[no-untyped-def]
     """Search by Newton's method inside a bracket."""
@@ -347,4 +341,4 @@ def slope_at_rest(where, row, s):  # type: ignore[no-untyped-def]
 
 #: addresses of `begin`, to be called by that of a law, and of the other functions of all laws
 BEGIN = _begin.address
-OTHERS = _evaluate.address, _switch.address, _settle.address, _strain.address
+OTHERS = _evaluate.address, _switch.address, settle.address, _strain.address
