@@ -158,12 +158,6 @@ def _ends_of_stress(row, s, eps):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _inside(row, low, high):  # type: ignore[no-untyped-def]
-    """Return a stress between two bounds, the upper of which may be infinite."""
-    return 0.5 * (low + high) if high < math.inf else max(2.0 * low, row.k0)
-
-
-@inner
 def _halfway(low, high, sigma):  # type: ignore[no-untyped-def]
     """Return a stress between two bounds, halfway in the logarithm if possible."""
     if high == math.inf:
@@ -206,7 +200,7 @@ def stress_in(row, s, eps):  # type: ignore[no-untyped-def]
     if bounded:
         low, high = _ends_of_stress(row, s, eps)
         if not low < sigma < high:
-            sigma = _inside(row, low, high)
+            sigma = _halfway(low, high, max(low, row.k0))
     else:
         step = (eps - s.eps) / slope
         sigma += step * (1.0 - 0.5 * step * s.curvature / slope)
@@ -226,7 +220,7 @@ def stress_in(row, s, eps):  # type: ignore[no-untyped-def]
             low, high = _ends_of_stress(row, s, eps)
             bounded = True
             if not low < sigma < high:
-                sigma = _inside(row, low, high)
+                sigma = _halfway(low, high, max(low, row.k0))
                 continue
         if miss > 0.0:
             high = sigma
