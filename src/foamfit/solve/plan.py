@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -233,9 +232,8 @@ class Plan(NamedTuple):
         Return the memory as the run has left it.
         """
         memory = self._layout(rows, damped, directions, degree).memory()
-        drive, began = (self.mass, reals, self.values, self.time), perf_counter()
-        loop.integrate(*memory, rows, heights, *drive, out, log, endings)
-        cache.SPENT.seconds += perf_counter() - began
+        drive = self.mass, reals, self.values, self.time
+        cache.timed(loop.integrate, *memory, rows, heights, *drive, out, log, endings)
         return memory
 
     def _as_one(

@@ -162,13 +162,10 @@ class Model:
 
     def springs(self, values: Array) -> tuple[Spring, ...]:
         """Return the springs of a flat vector; InputError if one is not admissible."""
-        springs = []
-        for i, law in enumerate(self.laws):
-            own = self.own(i, values)
-            first = self.own_places[i] + own.size
-            pairs = values[first : first + 2 * self.relaxation * law.hysteretic].reshape(-1, 2)
-            springs.append(law.make(own.tolist(), [(float(g), float(tau)) for g, tau in pairs]))
-        return tuple(springs)
+        return tuple(
+            law.make(values[own].tolist(), list(zip(*values[terms].reshape(-1, 2).T, strict=True)))
+            for law, (_, own, terms) in zip(self.laws, self._compiled[0], strict=True)
+        )
 
     def chain(self, values: Array, height: float, area: float) -> Chain:
         """Return the chain of a flat vector, without interior masses."""

@@ -226,7 +226,7 @@ class LawSpring(Spring):
 
     def __init__(self, law: Law, values: Sequence[float], relaxation: Relaxation = ()) -> None:
         """Check the arguments and make the spring immutable."""
-        from foamfit.springs.compiled import row_of
+        from foamfit.springs.compiled import solver_row
 
         put = object.__setattr__
         put(self, "record", law)
@@ -235,7 +235,7 @@ class LawSpring(Spring):
         freeze_numbers(self, law)
         freeze_terms(self, relaxation)
         put(self, "numbers", tuple(getattr(self, name) for name in law.names))
-        if row_of(law, self.numbers) is None:
+        if solver_row(law, np.array(self.numbers)) is None:
             given = ", ".join(f"{n} = {v:g}" for n, v in zip(law.names, self.numbers, strict=True))
             raise InputError(f"{given} is not admissible: the law '{law.kind}' refuses it")
 

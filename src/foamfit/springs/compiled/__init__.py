@@ -54,14 +54,7 @@ def slopes_of(laws: Sequence[Compiled], rows: Array) -> Array:
     return np.array([[one[0] for one in found], [max(one) for one in found]])
 
 
-def row_of(law: Law, values: ArrayLike) -> Array | None:
-    """Return the row of a law from its parameters (and eta); None if they are not admissible."""
-    made = compiled(law)
-    row, own = np.zeros(made.columns), np.array(values, dtype=float)[: len(law.params)]
-    return row if made.fill(own, row) else None
-
-
-def solver_row(law: Law, values: Array, terms: ArrayLike, room: int) -> Array | None:
+def solver_row(law: Law, values: Array, terms: ArrayLike = (), room: int = 0) -> Array | None:
     """Return the row of a spring for the solver; None if it is not admissible.
 
     `values` are the parameters and eta. The row contains eta, `room` relaxation terms (g, τ), and

@@ -12,7 +12,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.solve.histories import stress_along
-from foamfit.springs.compiled import row_of
+from foamfit.springs.compiled import solver_row
 from foamfit.springs.compiled.contract import MOST_INTERNAL
 from foamfit.springs.laws.record import ADMISSIBLE, COMMON, Functions, Law, Param
 from foamfit.springs.spring import LawSpring
@@ -123,7 +123,7 @@ def _trial(law: Law) -> str | None:
         return wrong
     shown = ", ".join(f"{n} = {v:g}" for n, v in zip(law.own, values, strict=True))
     try:
-        if row_of(law, values) is None:
+        if solver_row(law, np.append(values, 0.0)) is None:
             return f"admissible refuses its own start values ({shown}); give others"
         stress, branches = stress_along(law, LawSpring(law, [*values, 0.0]).row, TRIED)
     except Exception as error:  # any error of the compiler in a user's function
