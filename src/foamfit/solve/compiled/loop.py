@@ -32,7 +32,7 @@ from foamfit.solve.compiled.run import (
     spring,
     unpack,
 )
-from foamfit.solve.compiled.samples import approach, fly, is_finite, write_inside
+from foamfit.solve.compiled.samples import APPROACH, FLIGHT, INSIDE, is_finite, write
 from foamfit.solve.scene import (
     DONE,
     FLAT_UNDER_STRESS,
@@ -270,7 +270,7 @@ def _begin(c, reals):  # type: ignore[no-untyped-def]
         c.y[2 * top + 1] = reals[SPEED]
         c.drive.value, c.drive.gravity = c.values[0], c.values[0] * c.per_mass[top]
         r.horizon = max(c.time[c.samples - 1], 1e-30)  # a sample at contact needs a step
-        approach(c, reals[SPEED])
+        write(c, c.y, reals[SPEED], APPROACH, c.none)
 
 
 @inner
@@ -300,7 +300,7 @@ def advance(words, how, struck, want):  # type: ignore[no-untyped-def]
         share, who, kind = first_event(c)
     if struck and how != PLAIN:
         whole = who < 0 and r.now + r.step >= r.horizon
-        write_inside(c, r.horizon if whole else r.now + share * r.step, want)
+        write(c, c.y, r.horizon if whole else r.now + share * r.step, INSIDE, want)
     if who < 0:
         if how != PLAIN:
             rates(c, c.new, c.f, c.none, r.now + r.step)
@@ -309,7 +309,7 @@ def advance(words, how, struck, want):  # type: ignore[no-untyped-def]
     moved = share * r.step > 1e-15 * abs(r.now)
     slope = _pass_event(c, want, share, who, kind)
     if kind == RELEASE:
-        fly(c, slope)
+        write(c, c.y, slope, FLIGHT, c.none)
         return RELEASED + c.none
     return (SWITCHED if moved else STALLED) + c.none
 

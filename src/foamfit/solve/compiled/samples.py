@@ -34,7 +34,10 @@ from foamfit.springs.compiled.contract import (
 )
 from foamfit.springs.laws.record import BEGUN, OWN_ETA, OWN_RELAXATION, STRUCK
 
-INSIDE, FLIGHT, APPROACH = -1, -2, -3  # instead of the number of a sample
+# Tasks, instead of the number of a sample: write those up to a time inside the step, those after
+# the end of contact (with dS/dt there instead of a time), and those before contact (with the
+# velocity of the striker).
+INSIDE, FLIGHT, APPROACH = -1, -2, -3
 KNOWN = -1  # instead of whether with derivatives, if all values are those of the state
 
 
@@ -285,7 +288,7 @@ def _fly(c, slope):  # type: ignore[no-untyped-def]
 
 @pointed(types.void(WHOLES_AT, REALS_AT, REAL, WHOLE, WHOLE))
 def sample_task(words, y, at, k, want):  # type: ignore[no-untyped-def]
-    """Write sample k from a state at a time, or do one of the tasks below zero."""
+    """Do what `write` is asked for."""
     c = unpack(words)
     if k == INSIDE:
         _write_inside(c, at, want)
@@ -302,23 +305,5 @@ _call_samples = calling(types.void, RECORD, REALS_AT, REAL, WHOLE, WHOLE)
 
 @inlined
 def write(c, y, at, k, want):  # type: ignore[no-untyped-def]
-    """Write sample k from a state at a time since the piece began."""
+    """Write sample k from a state at a time since the piece began, or do a task: INSIDE, …"""
     _call_samples(c.write_at, c, y, at, k, want)
-
-
-@inlined
-def approach(c, speed):  # type: ignore[no-untyped-def]
-    """Write the samples before contact, when only the striker moves."""
-    _call_samples(c.write_at, c, c.y, speed, APPROACH, 0)
-
-
-@inlined
-def fly(c, slope):  # type: ignore[no-untyped-def]
-    """Write the samples after the end of contact; `slope` is dS/dt there."""
-    _call_samples(c.write_at, c, c.y, slope, FLIGHT, 0)
-
-
-@inlined
-def write_inside(c, reached, want):  # type: ignore[no-untyped-def]
-    """Write the samples of an impact up to a time inside the step."""
-    _call_samples(c.write_at, c, c.y, reached, INSIDE, want)
