@@ -75,7 +75,9 @@ def derive(c, seed):  # type: ignore[no-untyped-def]
 
 @inner
 def tabulate(x, h, table):  # type: ignore[no-untyped-def]
-    """Fill the moments ∫₀¹ exp(-x (1-r)) r^m dr, m = 0 … 5, for steps of length h."""
+    """Fill the moments ∫₀¹ exp(-x (1-r)) r^m dr, m = 0 … 5, for steps of length h, if it is new."""
+    if abs(h - table[OF_STEP]) <= 1e-13 * h:
+        return
     table[OF_STEP] = h
     if x > 1.0:
         table[0] = -math.expm1(-x) / x
@@ -94,23 +96,41 @@ def tabulate(x, h, table):  # type: ignore[no-untyped-def]
 
 
 @inner
-def relax(c, h, tables, first, low, high, last, bump, d_first, d_middle):  # type: ignore[no-untyped-def]
+def quartic(first, middle, last, low, high):  # type: ignore[no-untyped-def]
+    """Return the coefficients 2 to 4 of a quartic with these values and slopes, and its `bump`.
+
+    That is what the middle adds to the cubic of the ends: bump times 16 r² (1-r)².
+    """
+    rise, bump = last - first, middle - (0.5 * (first + last) + 0.125 * (low - high))
+    square, cube = 3.0 * rise - 2.0 * low - high, low + high - 2.0 * rise
+    return square + 16.0 * bump, cube - 32.0 * bump, 16.0 * bump, bump
+
+
+@inner
+def integral(a, first, low, square, cube, fourth):  # type: ignore[no-untyped-def]
+    """Return ∫₀¹ exp(-x (1-r)) (first + low r + square r² + …) dr from the moments `a`.
+
+    From the next moments, a + 1, it returns the integral with another factor r: the sum of this
+    integral and its derivative by x.
+    """
+    return first * a[0] + low * a[1] + square * a[2] + cube * a[3] + fourth * a[4]
+
+
+@inner
+def relax(  # type: ignore[no-untyped-def]
+    c, h, tables, first, low, square, cube, fourth, d_first, d_middle
+):  # fmt: skip
     """Advance the relaxation terms and their derivatives over a step.
 
-    The stress goes from `first` to `last` with the slopes `low` and `high` at the ends, and `bump`
-    times 16 r² (1-r)².
+    The stress is the quartic with these coefficients.
     """
     s, p, y = c.springs, c.p, c.y
-    rise = last - first
-    square, cube = 3.0 * rise - 2.0 * low - high, low + high - 2.0 * rise
-    square, cube, fourth = square + 16.0 * bump, cube - 32.0 * bump, 16.0 * bump
     for k in range(c.terms):
         tau, a, dz = s[RELAX + 2 * k + 1], past(tables, k * TABLE), past(y, c.base + k * p)
         x = h / tau
         decay = math.exp(-x)
-        total = first * a[0] + low * a[1] + square * a[2] + cube * a[3] + fourth * a[4]
-        change = first * (a[1] - a[0]) + low * (a[2] - a[1]) + square * (a[3] - a[2])
-        change += cube * (a[4] - a[3]) + fourth * (a[5] - a[4])
+        total = integral(a, first, low, square, cube, fourth)
+        change = integral(past(a, 1), first, low, square, cube, fourth) - total
         by_tau = (decay * y[k] + total + x * change) * x / tau
         one, two, three = a[0] - 3.0 * a[1] + 2.0 * a[2], 4.0 * (a[1] - a[2]), 2.0 * a[2] - a[1]
         for j in range(p):
@@ -173,7 +193,7 @@ def step_to(c, part, h, m, seed, tol, weight):  # type: ignore[no-untyped-def]
             d_middle[j] = c.common[j]
         last = bring_to(c, part)
         low, high = slope * step, s.slope * step
-    bump = half - (0.5 * (first + last) + 0.125 * (low - high))
+    square, cube, fourth, bump = quartic(first, half, last, low, high)
     size = max(m[0], abs(last))
     if FOLLOWED * weight * abs(bump) > tol * size and m[1] > LEAST_STEP:
         if fades:
@@ -187,9 +207,8 @@ def step_to(c, part, h, m, seed, tol, weight):  # type: ignore[no-untyped-def]
     m[0] = size
     derive(c, seed)
     for k in range(c.terms):
-        if abs(h - tables[k * TABLE + OF_STEP]) > 1e-13 * h:
-            tabulate(h / s[RELAX + 2 * k + 1], h, past(tables, k * TABLE))
-    relax(c, h, tables, first, low, high, last, bump, d_first, d_middle)
+        tabulate(h / s[RELAX + 2 * k + 1], h, past(tables, k * TABLE))
+    relax(c, h, tables, first, low, square, cube, fourth, d_first, d_middle)
     return True
 
 
@@ -251,7 +270,6 @@ def follow(  # type: ignore[no-untyped-def]
     lasts = t[n - 1] - t[0]
     for k in range(c.terms):
         weight += s[RELAX + 2 * k] * min(1.0, lasts / s[RELAX + 2 * k + 1])
-        m[2 + k * TABLE + OF_STEP] = -1.0
     bring_to(c, 0.0)
     derive(c, start(samples))
     if c.fade_at:

@@ -12,12 +12,13 @@ import math
 from foamfit.solve.compiled.along import (
     FADING,
     FOLLOWED,
-    OF_STEP,
     SAME,
     TABLE,
     TOO_LONG,
     UNFIT,
     derive,
+    integral,
+    quartic,
     tabulate,
 )
 from foamfit.solve.compiled.internal import toward, values_of
@@ -54,8 +55,6 @@ def _begin(c):  # type: ignore[no-untyped-def]
         row, at = past(s, c.row), past(s, EPS)
         call_evaluate(n.evaluate, row, s, at, unit, -1 + c.none, DIRECTION, out)
         m[x * RATE + k], unit[k] = out[2 + x + k], 0.0
-    for k in range(x):
-        m[x * TABLES + 2 * k * TABLE + OF_STEP] = -1.0
 
 
 @inner
@@ -106,20 +105,14 @@ def _respond(c, h, tol):  # type: ignore[no-untyped-def]
             return False
         table, half = past(m, x * TABLES + 2 * k * TABLE), past(m, x * TABLES + (2 * k + 1) * TABLE)
         fade = -m[x * RATE + k] * h
-        if abs(h - table[OF_STEP]) > 1e-13 * h:
-            tabulate(fade, h, table)
-            tabulate(0.5 * fade, 0.5 * h, half)
-        first, last, low, high = (
-            m[x * FIRST + k], m[x * LAST + k], m[x * LOW + k], m[x * HIGH + k],
-        )  # fmt: skip
-        rise = last - first
-        bump = m[x * MIDDLE + k] - (0.5 * (first + last) + 0.125 * (low - high))
-        square = 3.0 * rise - 2.0 * low - high + 16.0 * bump
-        cube, fourth = low + high - 2.0 * rise - 32.0 * bump, 16.0 * bump
-        whole = first * table[0] + low * table[1] + square * table[2]
-        whole += cube * table[3] + fourth * table[4]
-        part = first * half[0] + 0.5 * low * half[1] + 0.25 * square * half[2]
-        part += 0.125 * cube * half[3] + 0.0625 * fourth * half[4]
+        tabulate(fade, h, table)
+        tabulate(0.5 * fade, 0.5 * h, half)
+        first, low = m[x * FIRST + k], m[x * LOW + k]
+        square, cube, fourth, bump = quartic(
+            first, m[x * MIDDLE + k], m[x * LAST + k], low, m[x * HIGH + k]
+        )
+        whole = integral(table, first, low, square, cube, fourth)
+        part = integral(half, first, 0.5 * low, 0.25 * square, 0.125 * cube, 0.0625 * fourth)
         before = m[x * FIRST_X + k]
         m[x * HALF_X + k] = math.exp(-0.5 * fade) * before + 0.5 * h * part
         m[x * LAST_X + k] = math.exp(-fade) * before + h * whole

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 
-from foamfit.solve.compiled.along import OF_STEP, TABLE, tabulate
+from foamfit.solve.compiled.along import TABLE, integral, tabulate
 from foamfit.solve.compiled.events import MIDDLE, suspicious
 from foamfit.solve.compiled.explicit import SHORTENING
 from foamfit.solve.compiled.motion import ONLY_DERIVATIVES, evaluate, rates, rates_of
@@ -72,8 +72,7 @@ def _prepare(c, h):  # type: ignore[no-untyped-def]
         for k in range(c.terms):
             g, a, at = s[RELAX + 2 * k], past(m, TABLES + k * TABLE), n.z_at + k
             x = h / s[RELAX + 2 * k + 1]
-            if abs(h - a[OF_STEP]) > 1e-13 * h:
-                tabulate(x, h, a)
+            tabulate(x, h, a)
             decay = math.exp(-x)
             new[at] = decay * y[at] - x * (m[FIRST] * (a[0] - a[2]) + low * (a[1] - a[2]))
             s.gain += g * (1.0 - x * a[2])
@@ -166,8 +165,8 @@ def _derive(c, h):  # type: ignore[no-untyped-def]
             a, tau, at = past(m, TABLES + k * TABLE), s[RELAX + 2 * k + 1], n.z_at + k
             x, after, what = h / tau, past(new, c.base + at * p), OWN_RELAXATION + 2 * k + 1
             s.gain -= s[RELAX + 2 * k] * x * a[1]
-            total = first * a[0] + low * a[1] + square * a[2]
-            change = first * (a[1] - a[0]) + low * (a[2] - a[1]) + square * (a[3] - a[2])
+            total = integral(a, first, low, square, 0.0, 0.0)
+            change = integral(past(a, 1), first, low, square, 0.0, 0.0) - total
             for j in range(p):
                 if c.directions[2 * j] == i and c.directions[2 * j + 1] == what:
                     after[j] += (math.exp(-x) * c.y[at] + total + x * change) * x / tau
