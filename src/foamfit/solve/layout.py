@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from importlib import import_module
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -147,46 +148,24 @@ def _functions(
 ) -> tuple[int, ...]:
     """Return the addresses of the functions that a run needs, 0 for others (see run.ADDRESSES).
 
-    A function is compiled when its address is first asked for.
+    A module is imported, and a function compiled, when its address is first asked for.
     """
-    from foamfit.solve.compiled import events, motion
-
-    group = inside = step = advance = drive = write = fade = short = 0
-    if several:
-        from foamfit.solve.compiled import groups
-
-        group = groups.group_values.address
-    if internal:
-        from foamfit.solve.compiled import internal as inner
-
-        inside = inner.inside_task.address
-    if fades:
-        from foamfit.solve.compiled import decay
-
-        fade = decay.fade.address
     if integrated:
-        from foamfit.solve.compiled import loop, samples
+        from foamfit.solve.compiled import loop
 
         cache.announce(loop.integrate, "the solver")
-        advance, write = loop.advance.address, samples.sample_task.address
-        if shape.degree:
-            from foamfit.solve.compiled import implicit
-
-            step = implicit.step.address
-        else:
-            from foamfit.solve.compiled import explicit
-
-            step = explicit.step.address
-    if integrated and not shape.struck:
-        from foamfit.solve.compiled import drive as driven
-
-        drive = driven.next_piece.address
-    if relaxes:
-        from foamfit.solve.compiled import series
-
-        short = series.relaxing_step.address
-    rates, change = motion.compute_rates.address, events.enter_branch.address
-    return rates, group, inside, change, step, advance, drive, write, fade, short
+    functions = (
+        ("motion", "compute_rates", True), ("groups", "group_values", several),
+        ("internal", "inside_task", internal), ("events", "enter_branch", True),
+        ("implicit" if shape.degree else "explicit", "step", integrated),
+        ("loop", "advance", integrated), ("drive", "next_piece", integrated and not shape.struck),
+        ("samples", "sample_task", integrated), ("decay", "fade", fades),
+        ("series", "relaxing_step", relaxes),
+    )  # fmt: skip
+    return tuple(
+        getattr(import_module(f"foamfit.solve.compiled.{module}"), name).address if needed else 0
+        for module, name, needed in functions
+    )
 
 
 def _memory_of_decay(one: Compiled, p: int) -> int:
