@@ -43,9 +43,8 @@ MOST_SAMPLED = 10_000_000  # in total
 # Error of a step over the requested error.
 ALONE, IN_SERIES, OF_MASSES = 1e-3, 2e-3, 1e-3
 OF_IMPLICIT, OF_IMPLICIT_MASSES = 3e-4, 2e-2  # of an implicit step
-SHORT = (
-    5e-4  # length of a short implicit step, as a share of the duration, for a truncation of 3e-8
-)
+# Length of a short implicit step, as a share of the duration, for a truncation of 3e-8.
+SHORT = 5e-4
 # Least error of a step; of vibrating masses, whose steps would not exceed rounding errors below it.
 LEAST_TOL, LEAST_OF_MASSES, LEAST_VIBRATING = 2e-14, 5e-13, 5e-12  # the last of implicit steps
 # Outcomes of explicit steps after which implicit ones are tried.
@@ -208,18 +207,21 @@ class Plan(NamedTuple):
     ) -> Array:  # fmt: skip
         """Return the numbers that the loop over time is given; see `loop`."""
         least = LEAST_OF_MASSES if len(self.ends) > 1 else LEAST_TOL
-        tol, most, brief = max(self.margin * rtol, least), self.max_steps, 0.0
+        tol, most, brief, over = max(self.margin * rtol, least), self.max_steps, 0.0, False
         if degree:
             damped = bool(rows[:, 0].any())
             factor = OF_IMPLICIT if len(self.ends) == 1 else OF_IMPLICIT_MASSES
             tol = max(factor * rtol, LEAST_TOL if damped else self.least)
             most = min(most, MOST_IMPLICIT_WORK // len(heights))
-            brief = self._brief(rows, heights, drag, tol)
+            first, lasts = self._slopes(rows)[0].tolist(), self._duration
+            springs = first, rows[:, 0].tolist(), heights.tolist()
+            if self.speed > 0.0:
+                mass = self.mass.item(-1)
+                lasts = min(lasts, 5.0 * rates.contact_time(*springs, mass, drag))
+                over = rates.is_overdamped(*springs, mass)
+            brief = SHORT * lasts * (tol / 3e-8) ** (1.0 / 6.0)
         elif self.implicit is None:
             most = self.max_explicit
-        over = False
-        if degree and self.speed > 0.0:
-            over = rates.is_overdamped(*self._in_numbers(rows, heights), self.mass.item(-1))
         scales = self._scales(rows, heights)
         return np.array((drag, 1.0, self.speed, tol, most, brief, over, followed, *scales))
 
@@ -265,22 +267,6 @@ class Plan(NamedTuple):
             endings[loop.SWITCHES] = len(log)
             endings[loop.FINITE] = np.isfinite(out[0]).all()
         return self._motion(out, AGGREGATE, endings, log, rows, 0.0)
-
-    def _in_numbers(
-        self, rows: Array, heights: Array
-    ) -> tuple[list[float], list[float], list[float]]:
-        """Return the slope at rest, η and height of each spring."""
-        return self._slopes(rows)[0].tolist(), rows[:, 0].tolist(), heights.tolist()
-
-    def _brief(self, rows: Array, heights: Array, drag: float, tol: float) -> float:
-        """Return the length of a short implicit step, s."""
-        duration = self._duration
-        if self.speed > 0.0:
-            springs = self._in_numbers(rows, heights)
-            lasts = rates.contact_time(*springs, self.mass.item(-1), drag)
-            duration = min(duration, 5.0 * lasts)
-        short: float = SHORT * duration * (tol / 3e-8) ** (1.0 / 6.0)
-        return short
 
     def _motion(
         self, out: Array, method: str, endings: Array, log: Array, rows: Array, lost: float
