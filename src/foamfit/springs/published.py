@@ -139,10 +139,8 @@ def _published_row(item: PublishedSet, spring: Spring, height: float) -> list[st
     k0, h = f"{spring.k0 / MPA:g}", f"{height / MM:.3f}"
     if not isinstance(spring, BistableSpring):
         return [item.name, spring.law.kind, k0, *[""] * 4, h, *[""] * 3]
-    drop, eta = (
-        f"{spring.dsigma / spring.sigma_a:.2f}",
-        "-" if item.eta is None else f"{item.eta:g}",
-    )
+    drop = f"{spring.dsigma / spring.sigma_a:.2f}"
+    eta = "-" if item.eta is None else f"{item.eta:g}"
     strains = [f"{strain:g}" for strain in (spring.eps_a, spring.eps_c)]
     slopes = [spring.kh_plus, spring.kh_minus, spring.kc]
     ratios = [f"{slope / spring.k0:.3g}" for slope in slopes]

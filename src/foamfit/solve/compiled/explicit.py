@@ -26,15 +26,7 @@ from foamfit.solve.compiled.events import (
 )
 from foamfit.solve.compiled.motion import rates
 from foamfit.solve.compiled.run import RECORD, STEPPED, unpack
-from foamfit.springs.compiled.contract import (
-    REAL,
-    WHOLE,
-    WHOLES_AT,
-    calling,
-    inner,
-    past,
-    pointed,
-)
+from foamfit.springs.compiled.contract import REAL, WHOLE, WHOLES_AT, calling, inner, past, pointed
 
 #: record, whether with derivatives, tolerance; returns 1 if the step was taken
 SHORTENING = WHOLE(WHOLES_AT, WHOLE, REAL)
@@ -102,13 +94,8 @@ def take(c, n, dt, at, want):  # type: ignore[no-untyped-def]
     for s in range(1, STEPPED + 1):
         target = c.new if s == STEPPED else c.state
         combine(c, n, s, dt, c.y, target)
-        rates(
-            c,
-            target,
-            past(c.stage, s * c.wide),
-            want,
-            at + TIMES[s] * dt if s < STEPPED else at + dt,
-        )
+        when = at + TIMES[s] * dt if s < STEPPED else at + dt
+        rates(c, target, past(c.stage, s * c.wide), want, when)
         if s == MIDWAY_STAGE:
             keep_midway(c)
 

@@ -180,9 +180,7 @@ def share_rate(c, g, i0, i1, rate, loose, flat, pushed, lossy):  # type: ignore[
             s.rate = (climb - s.drift) / slope if slope > 0.0 else 0.0
             rest -= s.height * s.rate if flat >= 0 else 0.0
     if flat >= 0:
-        spring(c, flat).rate = 0.0 if pushed else (
-            rest / spring(c, flat).height
-        )  # fmt: skip
+        spring(c, flat).rate = 0.0 if pushed else rest / spring(c, flat).height
 
 
 # ---------------------------------------------------------------- derivatives
@@ -209,11 +207,7 @@ def derive_group(c, g, y, f):  # type: ignore[no-untyped-def]
             soft += s.height / (s.gain * s.tangent)
     for i in range(i0, i1):  # of damped springs `total` becomes the whole derivative
         derive_spring(c, i, y)
-        s, own, total = (
-            spring(c, i),
-            past(c.own, 2 * i * p),
-            past(c.part, (c.count + i) * p),
-        )
+        s, own, total = spring(c, i), past(c.own, 2 * i * p), past(c.part, (c.count + i) * p)
         slope, at, share = s.gain * s.steep, numbers(c, i).eps_at, 0.0
         if s.eta > 0.0:
             share = s.height / s.loss
@@ -272,11 +266,7 @@ def derive_common(c, last, loose, flat, soft, weight, reach, rate, out):  # type
 def derive_share(c, i, y, f, is_flat, reach, out):  # type: ignore[no-untyped-def]
     """Fill the derivatives of the strain of a spring in a group of several; of its rate too."""
     p, at = c.p, numbers(c, i).eps_at
-    s, own, total = (
-        spring(c, i),
-        past(c.own, 2 * i * p),
-        past(c.part, (c.count + i) * p),
-    )
+    s, own, total = spring(c, i), past(c.own, 2 * i * p), past(c.part, (c.count + i) * p)
     strain, mine = past(c.strain, i * p), c.base + at * p
     if s.eta > 0.0:
         for j in range(p):
