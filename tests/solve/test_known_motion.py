@@ -122,44 +122,6 @@ def test_a_top_that_is_not_where_it_was_prescribed_is_refused(monkeypatch) -> No
     assert ff.simulate(chain(SHOE, SOFT), ff.DisplacementDrive(top), time, 1e-4).steps == 0
 
 
-FLAT = replace(ff.published["foam-1/model-1"].bistable, kh_plus=0.0)
-ALIKE = {
-    "flat": (FLAT, ("k0", "eps_a"), ("kc", "eps_c")),
-    "flat, relaxing": (
-        replace(FLAT, relaxation=[(0.5, 0.1)]), ("k0", "eps_a"), ("kc", "eps_c")),
-    "held": (
-        replace(SHOE, eta=1e4, relaxation=[(0.5, 0.1)]), ("k0", "sigma_plus"), ("sigma_minus",)),
-    "steep": (
-        replace(FLAT, kh_plus=1.4e7, eta=1e5, relaxation=[(0.5, 0.1)]), (), ("k0", "kc", "eps_a")),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", ALIKE)
-def test_a_derivative_that_does_not_exist_is_said_to_be_one_sided(name) -> None:
-    """For equal springs in a hold or on a common plateau, either spring may move first."""
-    spring, one_sided, both = ALIKE[name]
-    time = np.linspace(0.0, 1.0, 41)
-    drive = ff.DisplacementDrive(2 * H * np.interp(time, [0, 0.4, 0.7, 1], [0, 0.35, 0.35, 0.05]))
-
-    def run(first: ff.springs.spring.Spring, names: tuple[str, ...] = ()) -> ff.Response:
-        given = ff.Chain([first, spring], [H, H], AREA)
-        return ff.simulate(given, drive, time, 1e-10, sensitivities=names)
-
-    got = run(spring, tuple(f"s1_{short}" for short in one_sided + both))
-    for short in one_sided + both:
-        size = 1e-6 * getattr(spring, short)
-        sides = [
-            (run(replace(spring, **{short: getattr(spring, short) + way * size})).base_stress
-             - got.base_stress) / (way * size)
-            for way in (1.0, -1.0)
-        ]  # fmt: skip
-        found = got.sensitivities[f"s1_{short}"]
-        assert found.one_sided == (short in one_sided), short
-        assert (
-            np.abs(sides[0] - sides[1]).max() > 5e-3 * np.abs(sides[0]).max()
-        ) == found.one_sided
-
-
 @pytest.mark.parametrize("like", [0.0, 1e-9, 1e-6, -1e-6])
 def test_springs_alike_are_answered_while_the_motion_holds(like) -> None:
     """Rounding once reversed the springs in turn, and some values of rtol led to a refusal."""

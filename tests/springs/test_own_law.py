@@ -497,13 +497,3 @@ def test_a_law_is_pickled_by_its_name(bouc_wen: Law) -> None:
 def test_parameters_that_are_not_admissible_are_refused(bouc_wen: Law) -> None:
     with pytest.raises(ff.InputError, match=r"^k = -1 is not admissible: it must be positive"):
         bouc_wen.make((-1.0, *VALUES[1:]), ())
-
-
-@pytest.mark.parametrize("eta", [0.0, 1e4])
-def test_a_turning_point_of_a_smooth_law_is_not_one_sided(bouc_wen: Law, eta: float) -> None:
-    spring = bouc_wen.make([5e6, 0.3, 0.05, 1.2, eta], [])
-    time, names = np.linspace(0.0, 1.0, 41), ["s1_k", "s1_limit"]
-    chain = ff.Chain([spring, ff.LinearSpring(4e6, eta=eta)], [1e-3, 1e-3], area=2e-5)
-    drive = ff.DisplacementDrive(4e-4 * np.sin(np.pi * time) ** 2)
-    run = ff.simulate(chain, drive, time, 1e-8, sensitivities=names)
-    assert not any(run.sensitivities[name].one_sided for name in names)

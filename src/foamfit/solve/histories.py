@@ -14,7 +14,7 @@ from foamfit.solve.compiled import along, loop, static
 from foamfit.solve.layout import Shape, lay_out
 from foamfit.solve.scene import DONE, MOTION, NO_SWITCHES, STRESS
 from foamfit.springs.compiled import compiled
-from foamfit.springs.compiled.contract import FLOWS, INTERNAL, Compiled
+from foamfit.springs.compiled.contract import FLOWS, INTERNAL
 from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, Law
 
 _ONE = np.ones(1)
@@ -133,26 +133,6 @@ def add_dashpot(
         elif what == MOVED:
             shift = samples[:, 0] + samples[:, 1] * strain
             out[1 + p, 0] += eta / height * np.gradient(shift, time)
-
-
-def on_one_plateau(
-    laws: tuple[Compiled, ...], rows: Array, branches: Array, directions: NDArray[np.int64]
-) -> Array:
-    """Mark directions of springs that were on flat branches together: either may move first.
-
-    `rows` are those of the laws, `branches` (springs, n) the numbers of the branches.
-    """
-    flat = np.zeros(branches.shape, dtype=bool)
-    for i, one in enumerate(laws):
-        first, own = one.slopes[:1], rows[i]
-        if len(one.slopes) == 3 and 0.0 in own[[*one.slopes]]:  # bistable: those of branches
-            step = one.slopes[2] - first[0]
-            flat[i] = own[first[0] + step * branches[i].astype(np.int64)] == 0.0
-    if not flat.any():
-        return np.zeros(len(directions))
-    together = (flat & (flat.sum(axis=0) > 1)).any(axis=1)
-    marked = np.isin(directions[:, 1], (0, 2, 3)) & (directions[:, 0] >= 0)  # k0, dsigma, eps_a
-    return np.where(marked, together[directions[:, 0]], 0.0)
 
 
 def switches(time: Array, strain: Array, branches: Array) -> Array:

@@ -210,7 +210,7 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
         "common": (groups + 3) * p, "strain": count * p,
         "scales": SCALES + count + 2 * nodes + internals,
-        "now": len(NOW), "sided": p, "stage": STAGES * wide, "line": LINE * wide, "y": wide,
+        "now": len(NOW), "stage": STAGES * wide, "line": LINE * wide, "y": wide,
         "new": wide, "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
         "batch": BATCH * (6 + BY + parameters) + 2 * p + 8 * MOST_TERMS + 8,
         "aside": max(fades, relaxes, internal * (count * (1 + shape.terms) + groups + 1)),

@@ -173,7 +173,7 @@ class Plan(NamedTuple):
             if found is not None:
                 return found
         log = np.empty((logged if everything else 0, 5))
-        endings = np.empty(loop.ENDINGS + len(directions))
+        endings = np.empty(loop.ENDINGS)
         given = rows, heights, damped, directions, out, log, endings
         methods = self._methods(stiff)
         for degree in methods:
@@ -277,7 +277,7 @@ class Plan(NamedTuple):
             outcome = int(outcome) if outcome != scenes.DONE else scenes.NOT_FINITE
             loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
             raise scenes.failure(outcome, self.top, self.values, loose, steps=int(steps), time=time)
-        slopes = Slopes(out[1:, 1:], out[1:, 0], endings[loop.ENDINGS :]) if len(out) > 1 else None
+        slopes = Slopes(out[1:, 1:], out[1:, 0]) if len(out) > 1 else None
         if len(log):
             log = log[: int(switches)] if switches <= len(log) else np.empty((int(switches), 5))
         else:
@@ -294,7 +294,7 @@ class Plan(NamedTuple):
 
         Return None if internal variables do not decay as `compiled.decay` requires.
         """
-        count, wanted, n = len(heights), len(directions) > 0, self.time.size
+        count, n = len(heights), self.time.size
         alone = self.top == scenes.MOTION and count == 1
         shown = count if everything else 1
         out = np.empty((1 + len(directions), 1 + shown, n))
@@ -322,11 +322,7 @@ class Plan(NamedTuple):
         if not fine:
             loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
             raise scenes.failure(scenes.NOT_FINITE, self.top, self.values, loose)
-        slopes = Slopes(out[1:, 1:], out[1:, 0]) if wanted else None
-        if slopes is not None and everything and self.top == scenes.MOTION and count > 1:
-            rows = rows[:, 1 + 2 * self.terms :]
-            shared = histories.on_one_plateau(self.laws.made, rows, branches, directions)
-            slopes = slopes._replace(one_sided=shared)
+        slopes = Slopes(out[1:, 1:], out[1:, 0]) if len(out) > 1 else None
         switches = histories.switches(self.time, strains, branches) if everything else NO_SWITCHES
         return Motion(out[0, 1:], out[0, 0], math.nan, switches, 0, CLOSED_FORM, slopes)
 

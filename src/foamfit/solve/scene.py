@@ -30,7 +30,7 @@ _FAILURES = {
 _PULLED = (FLAT_UNDER_STRESS, NOT_FINITE)  # of a unilateral spring under a prescribed tension
 
 CLOSED_FORM = "closed form"
-NO_SWITCHES, _NONE = np.empty((0, 5)), np.zeros(0)
+NO_SWITCHES = np.empty((0, 5))
 
 
 class Slopes(NamedTuple):
@@ -38,7 +38,6 @@ class Slopes(NamedTuple):
 
     displacement: Array  #: (p, nodes, n_t)
     base_stress: Array  #: (p, n_t)
-    one_sided: Array = _NONE  #: 1 where left and right derivatives differ, (p,)
 
 
 class Motion(NamedTuple):

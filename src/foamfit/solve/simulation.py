@@ -280,16 +280,16 @@ def _distance_at_peak(scene: Plan, arrays: ChainArrays, motion: Motion, rtol: fl
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Derivative of a response with respect to one parameter, in SI units, at fixed times."""
+    """Derivative of a response with respect to one parameter, in SI units, at fixed times.
+
+    Where equal springs stop while they snap or share a flat branch, derivatives from above and
+    below differ, and this may be neither: the smallest change decides which of them continues.
+    """
 
     displacement: Array  #: m per unit of the parameter, (n_springs, n_t)
     #: Pa per unit of the parameter, (n_t,); its slope jumps at switches of branch, its value at
     #: the end of contact
     base_stress: Array
-    #: whether the derivatives from above and below differ, so that this may be neither: where equal
-    #: springs stop while they snap or share a flat branch, the smallest change decides which of
-    #: them continues
-    one_sided: bool = False
 
 
 def _sensitivities(
@@ -308,8 +308,7 @@ def _sensitivities(
         elif directions[p, 1] == OWN_HEIGHT and drag > 0.0:
             motion = motion - drag / chain.height * slopes.displacement[-1]
             stress = stress - drag / chain.height * slopes.base_stress[-1]
-        one_sided = slopes.one_sided.size > 0 and slopes.one_sided[p] > 0.0
-        out[name] = Sensitivity(motion, stress, bool(one_sided))
+        out[name] = Sensitivity(motion, stress)
     return out
 
 

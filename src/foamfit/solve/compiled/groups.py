@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 
-from foamfit.solve.compiled.events import ROUNDED
 from foamfit.solve.compiled.motion import (
     GROUP,
     LOSE,
@@ -30,10 +29,9 @@ from foamfit.solve.compiled.motion import (
 from foamfit.solve.compiled.run import numbers, spring, unpack
 from foamfit.solve.compiled.static import put, root, strain_at
 from foamfit.solve.scene import STRESS, VISCOUS
-from foamfit.springs.compiled.contract import BY_STRESS, INTERNAL, RELAX, X, inner, past, pointed
+from foamfit.springs.compiled.contract import INTERNAL, RELAX, X, inner, past, pointed
 
-STANDS, MOVES = 1e-12, 1e-9  # relative rates that are nothing but rounding, and more than that
-SNAPPING = (0, 2, 3)  # parameters of a bistable law on which the stress at A1 depends
+MOVES = 1e-9  # relative difference of stresses that is more than rounding
 
 
 @inner
@@ -282,33 +280,6 @@ def derive_share(c, i, y, f, is_flat, reach, out):  # type: ignore[no-untyped-de
     derive_inside(c, i, y, f, past(f, mine) if s.eta > 0.0 else strain)
 
 
-@inner
-def _mark_one_sided(c, g):  # type: ignore[no-untyped-def]
-    """Mark the derivatives that differ from above and below.
-
-    A snapping spring that stands still continues for one sign of the change of a parameter and is
-    held for the other; of several springs on flat branches, the sign decides which moves first.
-    """
-    p, flat, ready, common = c.p, 0, 0, past(c.common, g * c.p)
-    first, last = (c.ends[g - 1] if g > 0 else 0), c.ends[g]
-    for i in range(first, last):
-        s = spring(c, i)
-        ends = min(abs(s.eps - s.high), abs(s.eps - s.low)) < ROUNDED  # and may go on to one
-        flat += int(s.sigma_low == s.sigma_high and s.eta == 0.0)
-        ready += int(s.sigma_low < s.sigma_high and ends and s.eta == 0.0)
-    for i in range(first, last):
-        s, total = spring(c, i), past(c.part, (c.count + i) * p)
-        snaps = s.turns != 0.0 and numbers(c, i).kind == BY_STRESS
-        stands = snaps and abs(s.rate) * s.eta < STANDS * abs(c.carried[g])
-        for j in range(p):
-            if stands and abs(common[j] - total[j]) > MOVES * max(abs(common[j]), abs(total[j])):
-                c.sided[j] = 1.0
-            several = flat > 1 or (flat == 1 and ready > 0)
-            mine = c.directions[2 * j] == i and s.sigma_low == s.sigma_high and s.eta == 0.0
-            if several and mine and c.directions[2 * j + 1] in SNAPPING:
-                c.sided[j] = 1.0
-
-
 @pointed(GROUP)
 def group_values(words, g, y, f, want, at):  # type: ignore[no-untyped-def]
     """Fill the values of the springs of a group and their part of the rates `f`; return S."""
@@ -317,5 +288,4 @@ def group_values(words, g, y, f, want, at):  # type: ignore[no-untyped-def]
         _follow(c, g, y, f, want, at)
     if want:
         derive_group(c, g, y, f)
-        _mark_one_sided(c, g)
     return c.carried[g]

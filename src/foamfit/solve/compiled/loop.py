@@ -67,7 +67,7 @@ FIRST = 40.0  # first implicit step over a short one
 FADES = 5.0  # longest explicit step over a relaxation time; steps are stable up to 6.3
 TRIED, BEYOND = 500, 4.0  # steps, and expected steps over their bound, that end a hopeless run
 STOPPED = 0.1  # most of the velocity that a first step takes
-# Results of a run; after them, for each derivative, whether it is one-sided.
+# Results of a run.
 (
     OUTCOME, ENDED, STEPS, SWITCHES, FINITE, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST,
     STRESS_LOST,
@@ -389,8 +389,6 @@ def integrate(  # type: ignore[no-untyped-def]
     told[STRONGEST], told[FARTHEST] = r.largest, c.scales[OF_W]
     told[DAMPED_OUT] = r.damped
     told[MOTION_LOST], told[STRESS_LOST] = c.worst[0], c.worst[1]
-    for j in range(c.p):
-        told[ENDINGS + j] = c.sided[j]
 
 
 def lost(endings: Array) -> float:

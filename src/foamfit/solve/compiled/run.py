@@ -47,15 +47,15 @@ from foamfit.springs.laws.record import DRAG, OWN_ETA, OWN_HEIGHT
 # spring and of drag; of the held numbers of each spring; of the stress of each spring at fixed
 # strain, then of its T at fixed strain; of the stress of each group, then zeros and two rows to
 # work with; of the strains; scales of the kinds of components; numbers that change during a run;
-# whether derivatives from above and below differ; rates at the stages of a step; its dense output;
-# the state, that at the end of a step, and one between with its rates; zeros; errors; samples that
-# are computed together; what is set aside during a ramp, see `internal`. Those of implicit
-# steps: Jacobian, n rows of 2 reach + 1; vibrations, see `implicit.remember`, and the largest
-# motion and stress at a sample; values of the derivatives over the scales; a copy of `springs` and
-# `carried`; factored systems, complex, SYSTEMS of n rows of 3 reach + 1, and their right sides.
+# rates at the stages of a step; its dense output; the state, that at the end of a step, and one
+# between with its rates; zeros; errors; samples that are computed together; what is set aside
+# during a ramp, see `internal`. Those of implicit steps: Jacobian, n rows of 2 reach + 1;
+# vibrations, see `implicit.remember`, and the largest motion and stress at a sample; values of the
+# derivatives over the scales; a copy of `springs` and `carried`; factored systems, complex, SYSTEMS
+# of n rows of 3 reach + 1, and their right sides.
 FLOATS = (
     "springs", "per_mass", "drive", "carried", "own", "held", "part", "common", "strain", "scales",
-    "now", "sided", "stage", "line", "y", "new", "state", "f", "nil", "errors", "batch", "aside",
+    "now", "stage", "line", "y", "new", "state", "f", "nil", "errors", "batch", "aside",
     "jacobian", "alive", "worst", "largest", "kept", "systems", "right",
 )  # fmt: skip
 # Arrays of integers: rows of NUMBERS of the springs; one past the last spring of each group;
