@@ -165,7 +165,12 @@ class Options(Given):
         self, measurement: Measurement, model: str, params: lmfit.Parameters | None = None
     ) -> Problem:
         """Return the problem of fitting one model."""
-        params = self.params(measurement, model) if params is None else params
+        chosen = self.params(measurement, model)
+        if params is not None and chosen is not None:
+            raise InputError(
+                "fix and vary have no effect beside params; set the value and vary of params"
+            )
+        params = chosen if params is None else params
         model = with_options(model, **self.of_springs)
         return make_problem(
             measurement,

@@ -55,6 +55,22 @@ def test_confidence_intervals_of_lmfit_are_the_profile_intervals(result):
         assert [ends[0], ends[-1]] == pytest.approx([low, high], abs=0.03 * (high - low))
 
 
+def test_a_parameter_at_its_limit_does_not_freeze_the_others():
+    """With a dashpot at zero lmfit's intervals were up to 40 times too narrow."""
+    test = synthetic_impact()[1]
+    result = ff.fit(test, starts=4, intervals="local")
+    assert result.parameters["s1_eta"].value == 0.0
+    assert result.parameters["s1_eta"].vary
+    one = result.parameters["s1_k0"]
+    found = lmfit.conf_interval(result.minimizer, result.lmfit, p_names=["s1_k0"], sigmas=[1.96])
+    ends = [value for _, value in found["s1_k0"]]
+    assert ends[-1] - ends[0] == pytest.approx(3.92 * one.stderr, rel=0.4)
+    with pytest.raises(ff.InputError, match="no effect beside params"):
+        ff.fit(test, params=result.params, fix={"s1_k0": 4e6})
+    with pytest.raises(ff.InputError, match="must be a number in SI"):
+        ff.fit(test, fix={"s1_k0": "5.5 MPa"})
+
+
 def test_a_result_read_back_has_the_same_objects(result, tmp_path):
     again = ff.load(result.save(tmp_path / "result", report=False))
     assert lmfit.fit_report(again.lmfit) == lmfit.fit_report(result.lmfit)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 METHOD = "foamfit, multi-start Levenberg-Marquardt"
 # Largest relative difference between the χ² of a result and that of its own residual.
 SAME = 1e-6
+INSIDE = 1e-3  # distance of a value from its limit, in standard errors
 
 
 def problem_of(fit: Fit) -> Problem:
@@ -67,12 +68,20 @@ def minimizer_of(fit: Fit) -> lmfit.Minimizer:
 
 
 def lmfit_params(fit: Fit) -> lmfit.Parameters:
-    """Return the parameters of a result; those without a standard error are held."""
+    """Return the parameters of a result; those without a standard error are held.
+
+    At a limit lmfit's transformation of the parameter has no slope, and its descents stand still:
+    such a value is moved inside by a small part of its standard error.
+    """
     params = fit.params.copy()
     for name, one in fit.params.items():
         params[name].correl, params[name].init_value = one.correl, None
         if one.vary and one.stderr is None:
             params[name].vary = False
+        elif one.vary:
+            room = min(INSIDE * one.stderr, 0.5 * (one.max - one.min))
+            params[name].value = min(max(one.value, one.min + room), one.max - room)
+            params[name].stderr = one.stderr
     return params
 
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from numbers import Real
 
 import lmfit
 import numpy as np
@@ -129,7 +130,9 @@ def fix_and_vary(
                 f"'{name}' is given by the specimen; leave [specimen] heights out to have it fitted"
             )
     for name, value in fix.items():
-        params[name].set(value=value, vary=False, min=-math.inf, max=math.inf)
+        if not isinstance(value, Real) or not math.isfinite(value):
+            raise InputError(f"fix: {name} = {value!r} must be a number in SI units, like 5.5e6")
+        params[name].set(value=float(value), vary=False, min=-math.inf, max=math.inf)
     for name in vary:
         params[name].set(vary=True)
     return params
