@@ -144,6 +144,24 @@ def test_a_time_of_day_in_twelve_hours_past_midnight(tmp_path):
     expect(read_test(path))
 
 
+@pytest.mark.parametrize("missing", ["NaN,NaN", "#N/A,#N/A", ",nan"])
+def test_rows_without_a_measured_number(tmp_path, missing):
+    body = rows(TIME, FORCE, MOTION)
+    for place in (N, 40, 0):
+        body.insert(place, f"{TIME[min(place, N - 1)] + 0.01},{missing}")
+    path = write(tmp_path, ["time (s),force (N),displacement (mm)", *body])
+    test = read_test(path)
+    assert test.displacement.max() == pytest.approx(4e-3, rel=1e-5)
+    assert test.rows.rows == N + 3
+    path.write_text(path.read_text().replace(missing, "1.0,NaN"))
+    refused(path, "row 2", "'NaN'; it must be a finite number")
+
+
+def test_a_thousandth_of_an_inch(tmp_path):
+    body = rows(TIME, FORCE, MOTION / 0.0254)
+    expect(read_test(write(tmp_path, ["time (s),force (N),displacement (mil)", *body])))
+
+
 def test_columns_of_fixed_width(tmp_path):
     width = "{:>10}{:>18}{:>22}{:>8}"
     head = [

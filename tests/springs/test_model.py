@@ -29,6 +29,8 @@ def test_a_vector_that_is_not_admissible_has_no_rows(place: int, value: float) -
 def test_a_number_of_terms_that_is_none_is_refused(number: object) -> None:
     with pytest.raises(ff.InputError, match=r"relaxation = .* must be a whole number"):
         Model.parse("bistable", number)  # type: ignore[arg-type]
+    with pytest.raises(ff.InputError, match="no hysteretic spring that could relax"):
+        Model.parse("linear", 1)
 
 
 @pytest.mark.parametrize("given", [0.5, [0.5], [(0.5,)], [(0.5, 0.2, 0.1)], None, [None]])

@@ -46,7 +46,8 @@ def _unit(text: str) -> Any:
 
 def _spellings(text: str) -> list[str]:
     usual = [unit for unit in _USUAL if unit.casefold() == text.strip().casefold()]
-    return [text, *usual, text.lower()]
+    inches = ["thou"] if text.strip().casefold() in ("mil", "mils") else []  # pint's are angles
+    return [text, *usual, text.lower(), *inches]
 
 
 def is_unit(text: str, *, any_case: bool = False) -> bool:

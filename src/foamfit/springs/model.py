@@ -50,7 +50,8 @@ class Model:
         Raises
         ------
         InputError
-            If a spring in it is unknown, or there are too many of them or of relaxation terms.
+            If a spring in it is unknown, there are too many of them or of relaxation terms, or no
+            spring relaxes.
         """
         if type(relaxation) is not int or not 0 <= relaxation <= MOST_TERMS:
             raise InputError(
@@ -70,6 +71,10 @@ class Model:
                     f"model '{name}': '{kind}' is not a spring; "
                     f"join {', '.join(laws.kinds())} by '+', from the base up"
                 )
+        if relaxation and not any(laws.law(kind).hysteretic for kind in kinds):
+            raise InputError(
+                f"model '{name}' has no hysteretic spring that could relax; leave relaxation out"
+            )
         return cls(kinds, relaxation)
 
     @classmethod

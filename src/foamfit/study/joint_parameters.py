@@ -39,7 +39,8 @@ from foamfit.trust.covariance import Ends
 _OF_A_SEARCH = ("ended", "agree")
 _BLANK = ParameterEstimate(math.nan, systematic=None)  # known for the fits of single tests only
 LARGEST = 300.0  # largest logarithm of a common value that the tests do not determine
-DOMINANT = 0.5  # a test with at least this share of χ² causes a warning
+# More than this share of χ², and this multiple of its share of samples, make a test dominant.
+DOMINANT, MORE = 0.5, 2.0
 
 
 def fit_of_test(
@@ -332,12 +333,14 @@ def _with_words(
             elif misfit > POOR:
                 large.append((test, curve, misfit))
     rates = [rate for rate in result.rates if rate is not None]
+    top = max(result.tests.values(), key=lambda one: one.chi2_share)
     told: dict[str, Any] = {
         "result": result,
         "laws": RATES,
         "rates": f"{min(rates):.3g} to {max(rates):.3g} 1/s" if rates else "",
         "slopes": [(n, result.parameters[n].kind, half) for n, half in open_slopes.items()],
-        "dominant": DOMINANT,
+        "dominant": max(DOMINANT, MORE * top.n_data / fit.found.n_data),
+        "top": (next(name for name, one in result.tests.items() if one is top), top),
         "lost": list(lost),
         "large": large,
         "wrong": wrong,

@@ -30,6 +30,7 @@ _ABOVE = 40  # number of rows compared with the last row
 _NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?)", re.IGNORECASE | re.ASCII
 )
+_MISSING = ("", "nan", "na", "n/a", "#n/a")  # what programs write for a missing number
 # A time of day such as 12:00:00.5 or 3:00:00.5 PM, with or without a date before it.
 _OF_DAY = re.compile(
     r"(?:[\d./-]+[T ]+)?(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,]\d+)?)(?: ?([ap])m)?",
@@ -345,8 +346,8 @@ def _checked_numbers(table: Table, columns: dict[str, int]) -> tuple[Array, Inte
         if any(cells[count:]):
             wrong = f"row {row} has {len(cells)} cells, but the header has {count}"
             raise InputError(f"{wrong}; every row must have as many as the header.")
-        if not any(cells[k] for k in measured):
-            filled = list(filter(None, cells))
+        if all(cells[k].lower() in _MISSING for k in measured):
+            filled = [cell for cell in cells if cell.lower() not in _MISSING]
             if len(filled) == 1 and _is_sample(re.split(r"[\s;|,]+", filled[0])):
                 raise InputError(
                     f"row {row} has its numbers in one cell, {filled[0][:LONGEST]!r}; all rows "
