@@ -32,8 +32,8 @@ from foamfit.trust.scatter import Spread, common_and_spread, correlation
 
 ROUNDS = 12  # most iterations between best values and spreads
 STILL = 0.01  # relative change of the spreads at which these iterations end
-# Least spread used in a fit, in units of the error of a single test. A stronger pull is taken off by
-# a long linear step, which multiplies the errors of the fit along a flat valley: the spreads of kc
+# Least spread used in a fit, in units of the error of a single test. A stronger pull is taken off
+# by a long linear step, which multiplies the errors of the fit along a flat valley: those of kc
 # and eps_star of four shoe foams never settled (0.05 and 3 in turn).
 LEAST_SPREAD = 2.0
 # Tests in which the logarithm of a parameter has a larger error (a factor of 150) are ignored.
