@@ -56,6 +56,20 @@ def test_noise_of_first_order_is_no_error_of_the_law(n, rho):
     assert all(one.evidence < 0.0 for one in found)
 
 
+def test_noise_that_one_curve_leaves_in_an_exact_one_is_no_error_of_the_law():
+    """An impact with a displacement of 1 µm was said to be missed by the law."""
+    n, rng = 400, np.random.default_rng(3)
+    slopes = np.concatenate([np.polynomial.legendre.legvander(np.linspace(-1, 1, n), 7)] * 2)
+    noise = rng.standard_normal(2 * n) * np.repeat([1.0, 1e-3], n)
+    residual = noise - slopes @ np.linalg.lstsq(slopes, noise, rcond=None)[0]
+    assert np.std(residual[n:]) > 10.0 * 1e-3  # by noise of the first curve
+    found = curve_errors(residual, slopes, (n, n))
+    assert not any(one.found for one in found)
+    assert found[1].noise.variance == pytest.approx(1e-6, rel=0.5)
+    residual[n:] += 0.05 * wave(n)  # which the parameters do not follow
+    assert curve_errors(residual, slopes, (n, n))[1].found
+
+
 @pytest.mark.parametrize("size", [1.0, 3.0, 30.0])
 def test_the_noise_beside_an_error_of_the_law_is_that_of_the_high_frequencies(size):
     rng = np.random.default_rng(3)

@@ -1,11 +1,10 @@
 """Benchmarks of the simulation; they are not tests and assert nothing about times.
 
     pip install ".[benchmark]"
-    pytest tests/benchmarks/bench_forward.py --benchmark-group-by=group
-    pytest tests/benchmarks/bench_forward.py -k springs --benchmark-json=before.json
+    pytest experiments/error_vs_runtime/bench_forward.py --benchmark-group-by=group
+    pytest experiments/error_vs_runtime/bench_forward.py -k springs --benchmark-json=before.json
 
-By default `pytest` does not collect this file (its name does not start with `test_`). The springs
-are those of experiments/error_vs_runtime, whose `forward.py` compares foamfit with SciPy.
+The springs are those of `forward.py`, which compares foamfit with SciPy.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import pytest
 import foamfit as ff
 from foamfit.solve.plan import plan
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments" / "error_vs_runtime"))
+sys.path.insert(0, str(Path(__file__).parent))
 import rivals as kinds
 
 SIZES = (1, 10, 100, 1000)
