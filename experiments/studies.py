@@ -123,6 +123,7 @@ def write_csv(
     """Write rows, or a DataFrame, with `digits` significant digits; compressed if named .gz."""
     frame = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows))
     raw: Any = {"method": "gzip", "mtime": 0} if path.suffix == ".gz" else None
+    path.parent.mkdir(parents=True, exist_ok=True)
     frame.to_csv(
         path, index=False, float_format=f"%.{digits}g", lineterminator="\n", compression=raw
     )
