@@ -156,3 +156,15 @@ def law_in_words(model: str, relaxation: int) -> str:
     words, more = _in_words(model)
     more += [counted(relaxation, "relaxation term")] if relaxation else []
     return f"{words} with {listed(more)}" if more else words
+
+
+class OfLaw:
+    """A result that has a model and the number of relaxation terms of its springs."""
+
+    model: str
+    relaxation: int
+
+    @property
+    def law(self) -> str:
+        """The model and its relaxation in words."""
+        return law_in_words(self.model, self.relaxation)

@@ -15,7 +15,7 @@ from foamfit.codec import plain
 from foamfit.data.calibration import Contradiction
 from foamfit.data.cycles import cycles_of, loading_rate
 from foamfit.data.measurement import Measurement, interior_channel
-from foamfit.parts import Ladder, ParameterEstimate, law_in_words
+from foamfit.parts import Ladder, OfLaw, ParameterEstimate
 from foamfit.springs.chain import Chain
 from foamfit.springs.spring import Spring
 
@@ -221,6 +221,11 @@ class Check:
     fatal: bool = False  # whether a "no" means that no acceptable fit was found
 
 
+def stamp() -> dict[str, Any]:
+    """Return the entries with which every result file begins."""
+    return {"schema": SCHEMA, "foamfit": version("foamfit")}
+
+
 def loop_of(test: Measurement, along: Array | None, over_time: Array | None) -> Loop | None:
     """Return the loop of a test against strain, or else against time; None without stress.
 
@@ -242,7 +247,7 @@ def flags_of(test: Measurement) -> dict[str, Array]:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(OfLaw):
     """Result of a fit."""
 
     measurement: Measurement
@@ -339,11 +344,6 @@ class Fit:
         return next((check.answer for check in self.checklist if check.key == "noise"), None)
 
     @property
-    def law(self) -> str:
-        """The model and its relaxation in words."""
-        return law_in_words(self.model, self.relaxation)
-
-    @property
     def strain(self) -> Array | None:
         """Overall strain along the fitted curves; None if neither simulated nor measured."""
         c = self.curves
@@ -408,8 +408,7 @@ class Fit:
         optional = {"budget": self.budget and self.budget.contributions}
         optional |= {name: getattr(self, name) for name in more}
         content = {
-            "schema": SCHEMA,
-            "foamfit": version("foamfit"),
+            **stamp(),
             "test": test.name,
             "data_sha256": test.data_sha256,
             "data": asdict(test.rows)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -30,7 +29,7 @@ from foamfit.report.shown import Result, brief
 from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
 from foamfit.report.summary import CURVES
 from foamfit.report.tables import by_test_tex, frame, stacked, varied, wide
-from foamfit.results import Fit
+from foamfit.results import Fit, stamp
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, percent
 from foamfit.trust.intervals import Announce
@@ -40,7 +39,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SCHEMA = 1
 ENERGY = "dissipated_energy"
 MOST_LOOPS = 12
 MOST_NAMES = 12  # more parameters than this are not printed; all are in cycles.csv
@@ -92,7 +90,7 @@ class CycleFits(Result):
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of cycles.json, in plain types."""
-        content = {"schema": SCHEMA, "foamfit": version("foamfit"), "fitted": sorted(self.results)}
+        content = {**stamp(), "fitted": sorted(self.results)}
         names = (one.name for one in fields(self) if one.name != "results")
         return dict(plain(content | {name: getattr(self, name) for name in names}))
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,7 @@ import numpy as np
 from foamfit.api import FitResult
 from foamfit.codec import plain
 from foamfit.fitting.links import RATES
-from foamfit.parts import ParameterEstimate, law_in_words
+from foamfit.parts import OfLaw, ParameterEstimate
 from foamfit.report import figures
 from foamfit.report.figures import TWO
 from foamfit.report.folder import write_json, write_result, write_text
@@ -26,7 +25,7 @@ from foamfit.report.render import page, words
 from foamfit.report.shown import Result, brief
 from foamfit.report.studies.parameters import Panel, plot_parameters
 from foamfit.report.tables import MISFITS, formula, frame, parameters_tex, stacked, symbols
-from foamfit.results import SCHEMA, Fit, Loop
+from foamfit.results import Fit, Loop, stamp
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.joint_fit import Alternative, JointFit
@@ -62,7 +61,7 @@ class JointTest:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class JointResult(Result):
+class JointResult(Result, OfLaw):
     """The result of a joint fit; the fields are those of joint.json, except the last ones.
 
     "covariance" is that of shared values, common values of scattering parameters, and for rate laws
@@ -115,11 +114,6 @@ class JointResult(Result):
         every = self.parameters.items()
         return {n: p for n, p in every if n not in NUISANCE and (p.kind != "fixed" or p.value)}
 
-    @property
-    def law(self) -> str:
-        """The model and its relaxation in words."""
-        return law_in_words(self.model, self.relaxation)
-
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the loops of all tests, measured and fitted, into axes or a new figure."""
         return draw_loops(self.loops, ax)
@@ -171,12 +165,11 @@ class JointResult(Result):
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of joint.json: SI units, plain types, null for missing values."""
         model, names = Model.parse(self.model), (one.name for one in fields(self))
-        content = {"schema": SCHEMA, "foamfit": version("foamfit")}
-        content |= {name: getattr(self, name) for name in names if name not in _NOT_IN_FILE}
-        shown: dict[str, Any] = plain(content | {"model": model.words, **model.options})
-        for one in shown["parameters"].values():
+        shown = {name: getattr(self, name) for name in names if name not in _NOT_IN_FILE}
+        content: dict[str, Any] = plain(stamp() | shown | {"model": model.words, **model.options})
+        for one in content["parameters"].values():
             one["state"] = one["state"] or None  # of an own parameter
-        return shown
+        return content
 
 
 def _between(one: ParameterEstimate) -> str:

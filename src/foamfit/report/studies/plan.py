@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,13 +13,14 @@ import numpy as np
 from foamfit.codec import plain
 from foamfit.data.measurement import Measurement
 from foamfit.data.rig import Candidate, Rig
-from foamfit.parts import law_in_words
+from foamfit.parts import OfLaw
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, TWO, VERMILION
 from foamfit.report.folder import write_json, write_text
 from foamfit.report.readable import own_name
 from foamfit.report.render import page, sentences, words
 from foamfit.report.shown import Result
+from foamfit.results import stamp
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import unit_of
 from foamfit.text import engineering
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SCHEMA = 1
 RISKY = 0.05  # largest probability of exceeding a limit of an advised test
 SHOWN = 3.2  # largest half interval over the scale of a parameter that the figure shows
 BEST = 12  # rows of the table of tests on the page
@@ -110,7 +109,7 @@ class Quantity:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Plan(Result):
+class Plan(Result, OfLaw):
     """The tests that a rig can make, ranked by what they would determine; SI."""
 
     tests: tuple[Measurement, ...]  #: the tests at hand
@@ -142,11 +141,6 @@ class Plan(Result):
     def name(self) -> str:
         """Name of the first test at hand."""
         return self.tests[0].name
-
-    @property
-    def law(self) -> str:
-        """The model and its relaxation in words."""
-        return law_in_words(self.model, self.relaxation)
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -190,8 +184,7 @@ class Plan(Result):
         best = self.advice
         pair = self.pair and [_asked(self.pair[0].candidate), _asked(self.pair[1])]
         content: dict[str, Any] = plain({
-            "schema": SCHEMA,
-            "foamfit": version("foamfit"),
+            **stamp(),
             "tests": [one.name for one in self.tests],
             "model": self.model,
             "relaxation": self.relaxation,

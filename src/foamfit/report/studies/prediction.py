@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,7 @@ from foamfit.arrays import Array
 from foamfit.codec import plain
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
-from foamfit.parts import ParameterEstimate, law_in_words
+from foamfit.parts import OfLaw, ParameterEstimate
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, INSIDE, TWO, VERMILION
 from foamfit.report.folder import write_columns, write_json
@@ -22,14 +21,13 @@ from foamfit.report.panels import Line, Panel, measured
 from foamfit.report.plots import panelled
 from foamfit.report.render import words
 from foamfit.report.shown import Result
-from foamfit.results import flags_of
+from foamfit.results import flags_of, stamp
 from foamfit.springs.model import Model
 from foamfit.text import percent
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SCHEMA = 1
 # Colour and dashes of each part of the band; the dashes distinguish them in greyscale.
 COLOURS: dict[str, tuple[str, Any]] = {
     "parameters": (BLUE, "-"),
@@ -93,7 +91,7 @@ class PredictedCurve:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Prediction(Result):
+class Prediction(Result, OfLaw):
     """Prediction, from a result, of a test that was not fitted; in SI."""
 
     source: str  #: Name of the result
@@ -141,11 +139,6 @@ class Prediction(Result):
             figures.write_both(plot_prediction(self, width=width), folder / "prediction")
 
     @property
-    def law(self) -> str:
-        """The model and its relaxation in words."""
-        return law_in_words(self.model, self.relaxation)
-
-    @property
     def inside(self) -> dict[str, float]:
         """Fraction of the samples of each curve inside its 95 % band."""
         return {name: curve.inside for name, curve in self.curves.items()}
@@ -176,7 +169,7 @@ class Prediction(Result):
             }
             for name, curve in self.curves.items()
         }
-        content = {"schema": SCHEMA, "foamfit": version("foamfit"), "test": m.name}
+        content = {**stamp(), "test": m.name}
         content |= {name: getattr(m, name) for name in ("data_sha256", "cycle", "last_cycle")}
         content |= {"result": self.source, "model": model.words, **model.options}
         content |= {name: getattr(self, name) for name in names} | {"curves": curves}
