@@ -35,8 +35,9 @@ from foamfit.report import figures
 from foamfit.report.figures import BLUE, FITTED, SEEN, images
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import environment, words
+from foamfit.report.shown import Result
 from foamfit.results import Fit
-from foamfit.study.identified import HasContent, read_source
+from foamfit.study.identified import read_source
 from foamfit.study.joint_result import JointResult
 from foamfit.study.saved import load
 from foamfit.text import percent, significant
@@ -251,7 +252,7 @@ def draw(card: Card) -> Figure:
 
 @single_threaded
 def card(
-    result: HasContent | str | Path,
+    result: Result | str | Path,
     *,
     format: str,
     units: str = "kg-mm-ms",

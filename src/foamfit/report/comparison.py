@@ -234,10 +234,7 @@ def published_side(name: str) -> Side:
     for i, spring in enumerate(item.chain.springs, start=1):
         values |= {f"s{i}_{name}": getattr(spring, name) for name in spring.law.own}
         values[f"s{i}_height"] = item.chain.heights[i - 1]
-    estimates = {
-        name: ParameterEstimate(value, None, None, "", False, "published", "")
-        for name, value in values.items()
-    }
+    estimates = {n: ParameterEstimate(x, vary=False, state="published") for n, x in values.items()}
     given = {"model": "+".join(spring.law.kind for spring in item.chain.springs)}
     return Side(f"published {name}", Model.of_result(given), estimates, values, _GIVEN, item)
 
@@ -352,7 +349,7 @@ def _with_error(value: float | None, stderr: float | None) -> str:
         return f"{value:.4g}".replace("-", "−")
     if max(abs(value), stderr) >= 1e5:
         return f"{significant(value, 3)} ± {significant(stderr)}".replace("-", "−")
-    return readable("", ParameterEstimate(value, stderr, None, "", True, "", "")).with_error
+    return readable("", ParameterEstimate(value, stderr)).with_error
 
 
 def plot_comparison(
@@ -385,7 +382,7 @@ def plot_comparison(
 
 def _estimate(value: float, stderr: float | None, unit: str, state: str) -> ParameterEstimate:
     ends = None if stderr is None else (value - 1.96 * stderr, value + 1.96 * stderr)
-    return ParameterEstimate(value, stderr, ends, unit, True, state, "")
+    return ParameterEstimate(value, stderr, ends, unit, state=state)
 
 
 def _math(label: str) -> str:

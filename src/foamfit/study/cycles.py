@@ -216,7 +216,7 @@ def fit_cycles(
 def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
     """Draw all loops in one panel, and start strain, energy, misfit and parameters by cycle.
 
-    For the parameters and `width` see `plot_parameters`. At most `MOST_LOOPS` loops are drawn.
+    For the parameters see `plot_parameters`. At most `MOST_LOOPS` loops are drawn.
     """
     results = dict(sorted(found.results.items()))
     loops = [
@@ -232,10 +232,7 @@ def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
     rows, panels = list(found.rows()), list[Panel]()
     for title, (column, factor) in BY_CYCLE.items():
         known = {f"cycle {row['cycle']}": row[column] for row in rows if row[column] is not None}
-        values = {
-            cycle: ParameterEstimate(factor * x, None, None, "", True, "determined", "")
-            for cycle, x in known.items()
-        }
+        values = {n: ParameterEstimate(factor * x, state="determined") for n, x in known.items()}
         panels.append(Panel(column, title, values))
     names = [f"cycle {number}" for number in results]
     return plot_parameters(

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,17 +21,11 @@ from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.options import DRIVES
 from foamfit.parts import ParameterEstimate
 from foamfit.report.folder import load_result
+from foamfit.report.shown import Result
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, split_name
 
 NORMAL = 1.959964  # half the 95 % interval of a normal distribution, in standard deviations
-
-
-class HasContent(Protocol):
-    """A result in memory."""
-
-    def to_json_dict(self) -> dict[str, Any]:
-        """Return the content of the result file."""
 
 
 class Miss(NamedTuple):
@@ -91,13 +85,14 @@ class Source:
         return math.sqrt(sum(squares) / len(squares)) if squares else 0.0
 
 
-def read_source(result: HasContent | str | Path) -> Source:
+def read_source(result: Result | str | Path) -> Source:
     """Read a result in memory, in a folder, or in its fit.json or joint.json.
 
     Raises InputError if there is no result, or if it lacks something that a prediction needs.
     """
     if isinstance(result, str | Path):
-        content, where = load_result(_file(Path(result))), str(result)
+        path, joint = Path(result), Path(result, "joint.json")
+        content, where = load_result(joint if joint.is_file() else path), str(result)
     elif hasattr(result, "to_json_dict"):
         content = result.to_json_dict()
         where = str(content.get("test") or content.get("name") or "the result")
@@ -111,12 +106,6 @@ def read_source(result: HasContent | str | Path) -> Source:
     except (KeyError, TypeError, ValueError, AttributeError) as error:  # InputError among them
         why = f"has no {error}" if isinstance(error, KeyError) else f"cannot be read: {error}"
         raise InputError(f"{where} {why}; give the result as foamfit wrote it") from None
-
-
-def _file(path: Path) -> Path:
-    """Return the file of a joint fit, or else the path of a fit or its folder."""
-    joint = path / "joint.json"
-    return joint if joint.is_file() else path
 
 
 def _source(content: Mapping[str, Any], where: str) -> Source:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,9 +27,10 @@ from foamfit.fitting.scenes import channel_of
 from foamfit.fitting.search import Tracker, descend
 from foamfit.parts import ParameterEstimate
 from foamfit.report import render
+from foamfit.report.shown import Result
 from foamfit.report.studies.prediction import COLOURS, PredictedCurve, Prediction
 from foamfit.springs.parameters import unit_of
-from foamfit.study.identified import NORMAL, HasContent, Source, read_source
+from foamfit.study.identified import NORMAL, Source, read_source
 from foamfit.study.population import Population
 from foamfit.text import engineering
 
@@ -45,7 +47,7 @@ ALIGNING = 40  # iterations of the fit of nuisance parameters
 
 @single_threaded
 def predict(
-    result: HasContent | str | Path,
+    result: Result | str | Path,
     test: Measurement | str | Path,
     *,
     drive: str | None = None,
@@ -390,12 +392,10 @@ def _parameters(
     ends = np.quantile(drawn, BAND, axis=0) if drawn else np.array([point - half, point + half])
     ends = np.clip(ends, *_limits(population, point))
     rows = zip(population.source.parameters.items(), point.tolist(), *ends.tolist(), strict=True)
-    out, blank = dict[str, ParameterEstimate](), ParameterEstimate(math.nan, systematic=None)
+    out = dict[str, ParameterEstimate]()
     for (name, one), value, low, high in rows:
-        unit, vary = unit_of(name), one.kind != "fixed"
-        out[name] = replace(
-            blank, value=value, ci95=(low, high), unit=unit, vary=vary, kind=one.kind
-        )
+        known: Any = {"unit": unit_of(name), "vary": one.kind != "fixed", "kind": one.kind}
+        out[name] = ParameterEstimate(value, None, (low, high), systematic=None, **known)
     return out
 
 
