@@ -8,7 +8,7 @@ simulated with each draw, and the expected interval of a parameter is the median
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -27,6 +27,7 @@ from foamfit.fitting.branches import unreached
 from foamfit.fitting.minimizer import problem_of
 from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import Problem, make_problem
+from foamfit.one_model import Progress
 from foamfit.parts import rung_name
 from foamfit.report.studies.plan import RISKY, Expected, Outcome, Plan
 from foamfit.solve.simulation import simulate
@@ -52,7 +53,6 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
 from foamfit.trust.ranges import ALIKE, tolerance
 
-Progress = Callable[[float, str], None]
 DRAWS = 40  # number of drawn foams
 TRIES = 60  # attempts per draw
 NEARLY = 0.1  # tests that determine this many parameters fewer, on average, count as equal
@@ -110,7 +110,9 @@ def plan(
     """
     tests, rivals = _read(results)
     rng, test = np.random.default_rng(seed), tests[0].problem.measurement
-    limits = _rig_of(rig, test, [tests[0], *rivals.values()])
+    # A hold is worth a try if one of the laws relaxes.
+    relaxing = any(one.problem.model.relaxation for one in (tests[0], *rivals.values()))
+    limits = read_rig(None if rig is None else Path(rig), test, relaxing=relaxing)
     asked = candidates(limits, test, len(tests[0].problem.model.kinds))
     if not asked:
         raise InputError(
@@ -154,7 +156,7 @@ def plan(
         rig=limits,
         now=now,
         outcomes=tuple(outcomes),
-        advised=best,
+        advice=None if best is None else outcomes[best],
         pair=pair and (outcome(asked[pair[0]], *(seen[i] for i in pair)), asked[pair[1]]),
         never=never,
         closing={mass: _closing(known, mass, limits) for mass in limits.masses},
@@ -191,12 +193,6 @@ def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
     return same, {
         rung_name(x.problem.model.name, "none", x.problem.model.relaxation): x for x in rest
     }
-
-
-def _rig_of(path: str | Path | None, test: Measurement, laws: Sequence[Test]) -> Rig:
-    """Return the rig; a hold is worth a try if one of the laws relaxes."""
-    relaxing = any(one.problem.model.relaxation for one in laws)
-    return read_rig(None if path is None else Path(path), test, relaxing=relaxing)
 
 
 def _published(name: str) -> Test:

@@ -118,7 +118,7 @@ class Plan(Result, OfLaw):
     rig: Rig
     now: dict[str, Expected]  #: what is known now
     outcomes: tuple[Outcome, ...]
-    advised: int | None  #: place of the advised test in `outcomes`; None if none is safe
+    advice: Outcome | None  #: that of the advised test; None if none is safe
     #: the pair of tests that determines most, with what both determine
     pair: tuple[Outcome, Candidate] | None
     never: dict[str, str]  #: parameters that no test of this rig determines, and what would
@@ -131,11 +131,6 @@ class Plan(Result, OfLaw):
     #: same rig then determines nothing
     contradicted: bool
     seed: int
-
-    @property
-    def advice(self) -> Outcome | None:
-        """The advised test."""
-        return None if self.advised is None else self.outcomes[self.advised]
 
     @property
     def name(self) -> str:
