@@ -9,6 +9,7 @@ import pytest
 
 import fabricated
 from foamfit.report.readable import readable
+from foamfit.report.result_figures import figures_of
 from foamfit.report.summary import render_report, summary_text
 
 
@@ -52,7 +53,7 @@ def page(**changed: Any) -> Page:
 
 
 def test_the_page_needs_nothing_else() -> None:
-    text = render_report(fabricated.result())
+    text = render_report(fabricated.result(), figures_of(fabricated.result()))
     whole = Page(text)
     assert whole.open == []  # every tag is closed, in order
     assert len(whole.references) == 1  # the figure of the fit

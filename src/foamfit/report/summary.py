@@ -13,7 +13,6 @@ from foamfit.report.figures import images
 from foamfit.report.plots import origin_word
 from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page, sentences, table, words
-from foamfit.report.result_figures import figures_of
 from foamfit.report.tables import count_determined
 from foamfit.results import STATED, Fit
 from foamfit.springs.parameters import NUISANCE
@@ -216,14 +215,11 @@ def tables(result: Fit) -> dict[str, list[list[str]]]:
     }
 
 
-def render_report(
-    result: Fit, figures: Mapping[str, Figure] | None = None, fit_svg: bytes | None = None
-) -> str:
+def render_report(result: Fit, drawn: Mapping[str, Figure], fit_svg: bytes | None = None) -> str:
     """Return the report as a self-contained HTML page.
 
-    `figures` are those of `figures_of`, `fit_svg` is the one of the fit as SVG, if there is one.
+    `drawn` are the figures of `figures_of`, `fit_svg` is that of the fit as SVG, if known.
     """
-    drawn = figures_of(result) if figures is None else figures
     svg = {} if fit_svg is None else {"fit": fit_svg}
     svg |= {name: images(one, "svg")[0] for name, one in drawn.items() if name not in svg}
     plain, springs, insight = result.to_json_dict(), result.springs, result.insight

@@ -212,8 +212,7 @@ def _more(found: JointResult, own: JointTest) -> dict[str, Any]:
 def plot_joint(found: JointResult, *, width: str = TWO) -> Figure:
     """Draw the loops, and below them the parameters of all tests side by side.
 
-    Tests are sorted by rate if rates differ. At most `MOST_LOOPS` loops are drawn. `width` is "one"
-    or "two" columns, or a length such as "85 mm".
+    Tests are sorted by rate if rates differ. At most `MOST_LOOPS` loops are drawn.
     """
     names = _in_order(found)
     loops = {one.name: one for one in found.loops}

@@ -81,8 +81,7 @@ def plot_parameters(
 
     A band is the 95 % interval of a common value, dashed lines its spread between specimens, ticks
     are references. Very wide intervals are cut; an arrow at the edge is a value outside the panel.
-    `width` is "one" or "two" columns, or a length such as "85 mm"; `above` draws a panel above the
-    others.
+    `above` draws a panel above the others; for `width` see `plots.plot_fit`.
     """
     wide, count, n = figures.inches(width), len(tests), max(len(panels), 1)
     step = max(-(-count // MOST_ROWS), 1)  # of very many tests only some are named

@@ -205,8 +205,7 @@ class Prediction(Result, OfLaw):
 def plot_prediction(found: Prediction, *, width: str = TWO) -> Figure:
     """Draw the loop, and each curve with its band and the half width due to each part below.
 
-    `width` is "one" or "two" columns, or a length such as "85 mm"; panels that do not fit side by
-    side are stacked.
+    For `width` see `plots.plot_fit`.
     """
     inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in found.curves.values())
     about = f"{found.measurement.name}, predicted from {found.source}"
