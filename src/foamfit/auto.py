@@ -311,11 +311,8 @@ def _hopeless(model: Model, tried: Sequence[Tried], unpromising: Sequence[Model]
         found = min(alone, key=lambda one: one.misfit, default=None)
         if found is None:
             return math.nan, ""
-        title = laws.law(found.result.model).title
-        return (
-            found.misfit,
-            f"one {title} misses the curves by {percent(found.misfit)} of the range",
-        )
+        title, misfit = laws.law(found.result.model).title, found.misfit
+        return misfit, f"one {title} misses the curves by {percent(misfit)} of the range"
 
     for poor in unpromising:
         if Counter(poor.kinds) <= Counter(model.kinds):

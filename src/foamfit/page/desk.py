@@ -33,6 +33,7 @@ from foamfit.page.worker import Job, Worker, parsed
 from foamfit.report import figures
 from foamfit.report.described import describe
 from foamfit.report.panels import Line, Panel, draw
+from foamfit.study.study_file import ENDINGS
 from foamfit.text import listed
 
 LARGEST = 64 * 1024 * 1024  # bytes of the largest file that can be dropped
@@ -40,7 +41,6 @@ LONGEST = 80  # characters of the longest file name
 TOGETHER = 5.0  # s within which a table and its TOML arrive if they are dropped together
 SAVED_TOML = "test.toml"  # name of the TOML that the page saves
 BUSY = "A fit is running; stop it before you change the test."
-TABLES = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
 # Label and example of each quantity to fill in, by its name in messages. The first `FIRST` are
 # always shown, the others folded away.
 FIRST = 4
@@ -96,9 +96,9 @@ class Desk:
             self.dropped = content
             self._ahead = now if now - self._came > TOGETHER else -math.inf
             return name
-        if suffix not in TABLES:
+        if suffix not in ENDINGS:
             raise InputError(
-                f"{name} is not a table; drop a file that ends in {listed(TABLES)}, or a TOML."
+                f"{name} is not a table; drop a file that ends in {listed(ENDINGS)}, or a TOML."
             )
         place = self.folder / "test"
         shutil.rmtree(place, ignore_errors=True)
@@ -114,7 +114,7 @@ class Desk:
 
         Only the command and the example may name such a file, never the browser.
         """
-        known = csv.suffix.lower() in TABLES
+        known = csv.suffix.lower() in ENDINGS
         self.receive(csv.name if known else f"{csv.stem}.csv", csv.read_bytes())
         toml = toml_beside(csv)
         if toml.is_file():

@@ -13,16 +13,7 @@ import numpy as np
 from foamfit.errors import InputError
 from foamfit.report import figures
 from foamfit.report.figures import GREY, TWO, VERMILION
-from foamfit.report.panels import (
-    Line,
-    Panel,
-    annotate,
-    draw,
-    draw_below,
-    is_known,
-    panels_of,
-    size,
-)
+from foamfit.report.panels import Line, Panel, annotate, draw, draw_below, is_known, panels_of, size
 from foamfit.report.readable import readable_unit
 from foamfit.terminal import printable
 
@@ -132,13 +123,8 @@ def plot_response(
     with panelled(panels, width) as (figure, drawn):
         for ax, panel, _ in drawn[:2]:
             if end is not None:
-                style: Any = {
-                    "color": GREY,
-                    "lw": 0.6,
-                    "ls": (0, (2, 2)),
-                    "label": "end of contact",
-                }
-                ax.axvline(end / panel.scale()[0], **style)
+                style: Any = {"color": GREY, "lw": 0.6, "ls": (0, (2, 2))}
+                ax.axvline(end / panel.scale()[0], label="end of contact", **style)
     return figures.save(figure, path)
 
 

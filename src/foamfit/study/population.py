@@ -129,10 +129,8 @@ class Population:
         slopes = np.zeros((len(self._parameters), len(free)))
         for column, name in zip(slopes.T, free, strict=True):
             one = self._parameters[name.removesuffix(":b")]
-            at, step = (
-                (one.b or 0.0) if name.endswith(":b") else one.value,
-                1e-4 * self._error(name),
-            )
+            at = (one.b or 0.0) if name.endswith(":b") else one.value
+            step = 1e-4 * self._error(name)
             sides = [self._vector(self._means | {name: at + sign * step}) for sign in (-1.0, 1.0)]
             column[:] = (sides[1] - sides[0]) / (2.0 * step)
         return slopes @ matrix @ slopes.T

@@ -39,11 +39,6 @@ def _text(right: str) -> Rule:
     return Rule(lambda v: isinstance(v, str) and bool(v.strip()), f"text, like {right}")
 
 
-def _of_fit(name: str) -> Rule:
-    """Check of an option of a fit."""
-    return Rule(OF_FIT[name].admits, OF_FIT[name].right)
-
-
 _PATTERNS = Rule(
     lambda v: isinstance(v, str) or (isinstance(v, list) and all(isinstance(p, str) for p in v)),
     'a list like tests = ["runs/*.csv"]',
@@ -55,7 +50,7 @@ _KEYS: dict[str, Check] = {
     "specimen": _text('specimen = "foam.toml"'),
     "cycle": COUNT,
     "cycles": RANGE,
-    **{name: _of_fit(name) for name in ("drive", "seed", "starts")},
+    **{n: Rule(OF_FIT[n].admits, OF_FIT[n].right) for n in ("drive", "seed", "starts")},
     **dict.fromkeys(FREED, FLAG),
     **dict.fromkeys(("relaxation", "specimens", "parameters"), anything),
 }
