@@ -108,9 +108,7 @@ class Given:
         usual=f"{STARTS} per spring, {STARTS_IN_SERIES} if several are hysteretic",
     )
     max_time: float | None = option(
-        "Time limit; the best point so far is returned.",
-        unit="s",
-        metavar="SECONDS",
+        "Time limit; the best point so far is returned.", unit="s", metavar="SECONDS"
     )
     fix: Mapping[str, float] | None = option(
         "Fix a parameter (SI).", metavar="NAME=VALUE", unit="SI", like="{'s1_eta': 0}"

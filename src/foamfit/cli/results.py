@@ -27,10 +27,7 @@ from foamfit.terminal import say
 @options.PLOT
 @options.WIDTH
 def compare(
-    results: tuple[Path, ...],
-    name: str | None,
-    plot: Path | None,
-    figure_width: str,
+    results: tuple[Path, ...], name: str | None, plot: Path | None, figure_width: str
 ) -> None:
     """Compare results with published parameters or each other.
 

@@ -149,16 +149,14 @@ def _tex(name: str, **values: Any) -> str:
 
 def frame(parameters: Mapping[str, Any], **more: Mapping[str, Any]) -> pd.DataFrame:
     """Return a row for each parameter, in SI; `more` are further columns, by parameter."""
-    made: pd.DataFrame = _frame_type()(_rows(parameters, more))
-    return made.set_index("parameter")
-
-
-def _rows(parameters: Mapping[str, Any], more: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    rows = []
     for own, (name, p) in zip(symbols(parameters), parameters.items(), strict=True):
         row = {"parameter": name, "symbol": formula(own), **numbers_of(p)}
         row |= {key: values.get(name) for key, values in more.items()}
         known = {key: np.nan if one is None else one for key, one in row.items()}
-        yield known | {"unit": getattr(p, "unit", ""), "state": p.state}
+        rows.append(known | {"unit": getattr(p, "unit", ""), "state": p.state})
+    made: pd.DataFrame = _frame_type()(rows)
+    return made.set_index("parameter")
 
 
 def numbers_of(p: Any) -> dict[str, float | None]:

@@ -218,11 +218,7 @@ def _several(rates: Sequence[float | None]) -> bool:
 
 
 def _own_fits(
-    study: Study,
-    options: Options,
-    tests: list[_Test],
-    refused: dict[str, str],
-    tell: Progress,
+    study: Study, options: Options, tests: list[_Test], refused: dict[str, str], tell: Progress
 ) -> tuple[list[_Test], Together]:
     """Return the tests that can be fitted, and the results of their separate fits.
 
