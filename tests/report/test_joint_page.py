@@ -13,10 +13,11 @@ from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
 from foamfit.fitting.together import Together
+from foamfit.parts import ParameterEstimate
 from foamfit.report.figures import images
 from foamfit.study.joint_fit import Alternative, fit_jointly
 from foamfit.study.joint_parameters import result_of
-from foamfit.study.joint_result import JointResult, joint_page, plot_joint
+from foamfit.study.joint_result import JointResult, JointTest, joint_page, plot_joint
 from foamfit.study.study_file import Study
 
 RATES = (0.01, 0.1, 1.0)
@@ -139,3 +140,10 @@ def test_parameters_stand_side_by_side(found):
 def test_a_result_in_python_draws_its_loops(found):
     assert repr(found).startswith("a & b: microscale · 3 tests together · status warnings")
     assert len(found.plot(Figure().subplots()).lines) == 6
+
+
+def test_the_table_has_the_common_values_alone_if_no_test_has_values_of_its_own():
+    shared = ParameterEstimate(5.5e5, state="determined", kind="shared")
+    tests = dict.fromkeys(("first", "second"), JointTest())
+    table = JointResult("study", "linear", tests, {"s1_k0": shared}).table()
+    assert table.index.to_list() == [("", "s1_k0")]

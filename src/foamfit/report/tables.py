@@ -155,7 +155,7 @@ def frame(parameters: Mapping[str, Any], **more: Mapping[str, Any]) -> pd.DataFr
         row |= {key: values.get(name) for key, values in more.items()}
         known = {key: np.nan if one is None else one for key, one in row.items()}
         rows.append(known | {"unit": getattr(p, "unit", ""), "state": p.state})
-    made: pd.DataFrame = _frame_type()(rows)
+    made: pd.DataFrame = _frame_type()(rows, columns=None if rows else ["parameter"])
     return made.set_index("parameter")
 
 
@@ -170,7 +170,8 @@ def stacked(frames: Mapping[Any, pd.DataFrame], name: str) -> pd.DataFrame:
     """Concatenate the tables of several tests; `name` is that of the new index level."""
     import pandas as pd
 
-    made: pd.DataFrame = _frame_type()(pd.concat(frames, names=[name]))
+    filled = {key: one for key, one in frames.items() if len(one)}
+    made: pd.DataFrame = _frame_type()(pd.concat(filled, names=[name]))
     return made
 
 
