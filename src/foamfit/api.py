@@ -14,7 +14,7 @@ from foamfit.arrays import single_threaded
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
 from foamfit.fitting.minimizer import minimizer_of, result_of
-from foamfit.one_model import SEARCHED, Options, Progress, identify, judge
+from foamfit.one_model import SEARCHED, Options, Progress, identify, judge, part_of
 from foamfit.options import Keywords, documented
 from foamfit.report.folder import write_result
 from foamfit.report.plots import draw_panel
@@ -153,22 +153,17 @@ def fit(
         Model.parse(model, chosen.relaxation)
     compile_once = cache(lambda: compile_solver(model))
 
-    def part(begin: float, end: float) -> Progress:
-        """Report the progress of a part of the work between two fractions of the whole."""
-
-        def shown(share: float, what: str) -> None:
-            compile_once()  # before the first simulation, after the arguments were checked
-            progress(begin + (end - begin) * share, what)
-
-        return shown
+    def shown(share: float, what: str) -> None:
+        compile_once()  # before the first simulation, after the arguments were checked
+        progress(share, what)
 
     if model == "auto":
         from foamfit.auto import compare_models
 
-        found = compare_models(measurement, chosen, part(0.0, 1.0), tell)
+        found = compare_models(measurement, chosen, shown, tell)
     else:
-        searched = identify(measurement, model, params, chosen, part(0.0, SEARCHED))
-        found, _ = judge(searched, chosen.choice, tell, part(SEARCHED, 1.0))
+        searched = identify(measurement, model, params, chosen, part_of(shown, 0.0, SEARCHED))
+        found, _ = judge(searched, chosen.choice, tell, part_of(shown, SEARCHED, 1.0))
         progress(1.0, "done")
     stored = chosen.stored(measurement, model) if params is None else None
     return FitResult(**vars(found) | {"options": stored})

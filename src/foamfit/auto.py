@@ -26,7 +26,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.problem import Problem, make_params
 from foamfit.fitting.search import SearchStoppedError, what_stopped
-from foamfit.one_model import Found, Options, Progress
+from foamfit.one_model import Found, Options, Progress, part_of
 from foamfit.options import FREED
 from foamfit.parts import Ladder, Rung, rung_name
 from foamfit.report import render
@@ -139,11 +139,7 @@ def compare_models(
     best = evidence.choose(tried).best
     wanted = options.choice.method != "local" or tried[best].best.misfits
     if state.stopped is None and wanted:
-
-        def tell(share: float, what: str) -> None:
-            done = CHOSEN + (1.0 - CHOSEN) * share
-            progress(done, f"model chosen, {tried[best].name}: {what}")
-
+        tell = part_of(progress, CHOSEN, 1.0, f"model chosen, {tried[best].name}: ")
         result, point = one_model.judge(state.fits[best], options.choice, announce, tell)
         tried[best] = replace(tried[best], result=result, best=point)  # it may have improved
     progress(1.0, "done")
@@ -261,11 +257,10 @@ class _Comparison:
             for name in _dampers(params):
                 params[name].set(value=0.0, vary=False)
         named = rung_name(model.name, damping, model.relaxation)
-
-        def tell(share: float, what: str) -> None:
-            done = CHOSEN * (self.number - 1 + before + 0.8 * part * share) / self.of
-            self.progress(done, f"model {self.number} of {self.of}: {named}: {what}")
-
+        start = CHOSEN * (self.number - 1 + before) / self.of
+        end = start + CHOSEN * 0.8 * part / self.of
+        told = f"model {self.number} of {self.of}: {named}: "
+        tell = part_of(self.progress, start, end, told)
         options = replace(self.options, max_time=left, relaxation=model.relaxation)
         look = partial(self._look, damping) if len(model.kinds) > 1 else None
         found = one_model.identify(self.measurement, model.name, params, options, tell, look, below)

@@ -185,6 +185,11 @@ class Options(Given):
         )
 
 
+def part_of(progress: Progress, begin: float, end: float, prefix: str = "") -> Progress:
+    """Report the progress of a part of the work, between two fractions of the whole."""
+    return lambda share, what: progress((1 - share) * begin + share * end, f"{prefix}{what}")
+
+
 @dataclass(frozen=True, eq=False)
 class Found:
     """Outcome of a search: the problem, the tracker with the best point, and the record."""

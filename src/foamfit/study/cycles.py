@@ -16,7 +16,7 @@ from foamfit.codec import plain
 from foamfit.data.csv_file import read_test
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.search import what_stopped
-from foamfit.one_model import Options, Progress
+from foamfit.one_model import Options, Progress, part_of
 from foamfit.options import Keywords
 from foamfit.parts import ParameterEstimate
 from foamfit.report import figures
@@ -191,10 +191,8 @@ def fit_cycles(
     results, refused = dict[int, Fit](), dict[int, str]()
     stopped = None
     for i, number in enumerate(wanted):
-
-        def notify(done: float, what: str, i: int = i, number: int = number) -> None:
-            report((i + done) / len(wanted), f"cycle {number}: {what}")
-
+        begin, end = i / len(wanted), (i + 1) / len(wanted)
+        notify = part_of(report, begin, end, f"cycle {number}: ")
         try:
             test = first if number == first.cycle else read_test(path, specimen, number)
             results[number] = fit(test, model=model, progress=notify, tell=tell, **options)
