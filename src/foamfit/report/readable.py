@@ -125,14 +125,6 @@ def symbol(name: str) -> tuple[str, str]:
     return stem, ",".join(filter(None, (index, term, str(spring + 1))))
 
 
-def own_symbol(name: str, springs: int = 1) -> tuple[str, str]:
-    """Return symbol and index of a parameter, without the spring if there is only one."""
-    stem, index = symbol(name)
-    if springs == 1 and split_name(name)[0] >= 0:
-        index = index.rpartition(",")[0]
-    return stem, index
-
-
 def _rounded(value: float, stderr: float) -> tuple[str, str, int]:
     """Return value and standard error to two digits of the error, and the number of decimals."""
     places = 1 - math.floor(math.log10(float(f"{stderr:.1e}")))

@@ -13,9 +13,9 @@ import numpy as np
 
 from foamfit.codec import plain
 from foamfit.parts import ParameterEstimate
-from foamfit.report.readable import own_symbol, readable, readable_unit
+from foamfit.report.readable import readable, readable_unit, symbol
 from foamfit.report.render import environment
-from foamfit.springs.parameters import NUISANCE, springs_first
+from foamfit.springs.parameters import NUISANCE, split_name, springs_first
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -130,8 +130,12 @@ def by_test_tex(first: str, tests: Sequence[str], parameters: ByTest) -> str:
 def symbols(names: Iterable[str]) -> list[tuple[str, str]]:
     """Return the symbols of parameters, without the spring if there is only one."""
     names = list(names)
-    springs = 1 + any(name.startswith("s2_") for name in names)
-    return [own_symbol(name, springs) for name in names]
+    several, found = any(name.startswith("s2_") for name in names), list[tuple[str, str]]()
+    for name in names:
+        stem, index = symbol(name)
+        alone = not several and split_name(name)[0] >= 0
+        found.append((stem, index.rpartition(",")[0] if alone else index))
+    return found
 
 
 def unit_of_all(each: Iterable[ParameterEstimate | None]) -> tuple[float, str]:
