@@ -16,7 +16,8 @@ import foamfit.report.folder
 import foamfit.report.summary
 from conftest import small_pictures
 from foamfit.errors import InputError
-from foamfit.report.folder import load_result
+from foamfit.report.figures import write_both
+from foamfit.report.folder import load_result, save_whole
 
 KEYS = {
     "schema", "foamfit", "test", "data_sha256", "model", "drive", "interior_mass", "seed",
@@ -181,3 +182,11 @@ def test_derived_numbers_of_a_microscale_spring() -> None:
     assert derived["p_max_strain"] == pytest.approx(0.6)
     on_a, on_c = 1.06e5 / (4.4e5 + 1.06e5), 0.29 + 1.06e5 / (4.9e5 + 1.06e5)
     assert derived["snap_strain"] == pytest.approx(on_c - on_a)
+
+
+def test_a_figure_that_cannot_be_written_names_the_folder_of_the_result(tmp_path: Path) -> None:
+    figure = fabricated.no_figures()["fit"]
+    with pytest.raises(InputError) as refused:
+        save_whole(tmp_path / "out", lambda fresh: write_both(figure, fresh / "none" / "joint"))
+    reason = "No such file or directory; choose another folder"
+    assert str(refused.value) == f"the result cannot be written to {tmp_path / 'out'}: {reason}"

@@ -215,10 +215,13 @@ def figure_format(path: str | Path) -> Format:
 
 
 def write_both(figure: Figure, place: Path) -> bytes:
-    """Write a figure as PNG and PDF; return it as SVG. `place` is a path without suffix."""
+    """Write a figure as PNG and PDF into a new folder; return it as SVG.
+
+    `place` is a path without suffix. Raises OSError, which `folder.save_whole` explains.
+    """
     png, pdf, svg = images(figure, "png", "pdf", "svg")
-    write_file(place.with_suffix(".png"), png)
-    write_file(place.with_suffix(".pdf"), pdf)
+    place.with_suffix(".png").write_bytes(png)
+    place.with_suffix(".pdf").write_bytes(pdf)
     return svg
 
 

@@ -19,7 +19,7 @@ from foamfit.arrays import Array
 from foamfit.codec import plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, reason, replacing
-from foamfit.report.figures import TWO, images
+from foamfit.report.figures import TWO, write_both
 from foamfit.report.result_figures import figures_of
 from foamfit.report.summary import render_report
 from foamfit.report.tables import numbers_of, parameters_tex, with_head
@@ -254,9 +254,7 @@ def write_result(result: Fit, folder: Path, *, pages: bool = True, width: str = 
         write_table(folder / "budget.csv", result.budget.rows())
     if pages:
         drawn = figures_of(result, width)
-        png, pdf, svg = images(drawn["fit"], "png", "pdf", "svg")
-        (folder / "fit.png").write_bytes(png)
-        (folder / "fit.pdf").write_bytes(pdf)
+        svg = write_both(drawn["fit"], folder / "fit")
         write_text(folder / "report.html", render_report(result, drawn, svg))
 
 

@@ -18,7 +18,8 @@ from foamfit.codec import build, plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.parts import ParameterEstimate, law_in_words
-from foamfit.report.figures import tail, write_both
+from foamfit.report import figures
+from foamfit.report.figures import tail
 from foamfit.report.folder import load_result
 from foamfit.report.render import page, words
 from foamfit.report.studies.parameters import panels_of, plot_parameters
@@ -356,7 +357,10 @@ def write_comparison(
     figure = plot_parameters(
         f"{title} · {counts_in_words(rows)}", tests, panels_of(tests, found), width=width
     )
-    return write_both(figure, folder / "summary")
+    png, pdf, svg = figures.images(figure, "png", "pdf", "svg")
+    write_file(folder / "summary.png", png)
+    write_file(folder / "summary.pdf", pdf)
+    return svg
 
 
 def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | None = None) -> None:
