@@ -22,6 +22,7 @@ import foamfit.results
 from conftest import RECONSTRUCTION, run, run_refused, without_pictures
 from foamfit.errors import InputError
 from foamfit.files import check_file, csv_bytes, replacing, write_file
+from foamfit.report import figures
 from foamfit.report.folder import check_target, load_result
 from foamfit.report.listing import row_of, write_summary
 from foamfit.report.plots import plot_fit
@@ -103,7 +104,7 @@ def test_a_full_disk_leaves_the_older_file(here: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(Path, "write_bytes", full)
     for path, make in (
         (here / "summary.csv", lambda path: write_summary([row], path.parent)),
-        (here / "b.png", lambda path: plot_fit(fabricated.result(), path)),
+        (here / "b.png", lambda path: figures.save(plot_fit(fabricated.result()), path)),
     ):
         path.write_text("older")
         with pytest.raises(InputError, match="No space left on device"):

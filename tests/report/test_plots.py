@@ -12,7 +12,7 @@ import fabricated
 import foamfit as ff
 from foamfit.api import FitResult
 from foamfit.errors import InputError
-from foamfit.report.figures import images
+from foamfit.report.figures import images, save
 from foamfit.report.plots import origin_word, plot_fit, plot_response
 from foamfit.report.result_figures import plot_snapping
 from foamfit.results import Switch
@@ -131,7 +131,7 @@ def test_a_name_is_no_formula_and_may_be_in_any_script() -> None:
 def test_a_figure_that_cannot_be_written_is_an_input_error(tmp_path: Path) -> None:
     for name, words in (("fit.docx", r"not 'fit\.docx'"), ("none/fit.png", "cannot be written")):
         with pytest.raises(InputError, match=words):
-            plot_fit(fabricated.result(), tmp_path / name)
+            save(plot_fit(fabricated.result()), tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["foam-1/model-1", "foam-1/model-3"])

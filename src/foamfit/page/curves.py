@@ -16,7 +16,7 @@ from bokeh.models import Band, ColumnDataSource, LabelSet, Range1d
 from bokeh.plotting import figure
 
 from foamfit.arrays import Array
-from foamfit.page.inputs import WIDE, Sliders, grid, message, piece
+from foamfit.page.inputs import WIDE, Sliders, grid, piece
 from foamfit.page.turning import PANELS, Drawn, Row, Turning
 from foamfit.report.figures import GREY, VERMILION
 from foamfit.report.readable import readable_unit
@@ -166,7 +166,7 @@ class Curves:
 
     def _moved(self, event: Any) -> None:
         """Draw the curves for the sliders that were moved, and store the ticks."""
-        sent = message(event)
+        sent = event.data if isinstance(event.data, dict) else {}  # a browser may send anything
         moves, held = (
             one if isinstance(one, dict) else {} for one in (sent.get("moves"), sent.get("held"))
         )

@@ -105,11 +105,6 @@ class Sliders(JSComponent):
         self._send_msg({"drawn": True})
 
 
-def message(event: Any) -> dict[str, Any]:
-    """Return the data of a message as a dictionary; a browser may send anything."""
-    return event.data if isinstance(event.data, dict) else {}
-
-
 class Field:
     """An input for one option of the command, with its name, default and help."""
 

@@ -358,7 +358,7 @@ def plot_comparison(
     """Draw fitted values with 95 % intervals, one row per result, and the references as ticks.
 
     Quantities that are neither compared nor lost (`Row.lost`) are omitted. For `path` and `width`
-    see `plots.plot_fit`.
+    see `plots.plot_response`.
     """
     sources = [pair.other.source for pair in comparison.pairs]
     tests = [

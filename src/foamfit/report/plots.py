@@ -33,13 +33,13 @@ LOOP, WIDER = 165.0, 1.45  # prescribed motion: height of the loop, its width ov
 Drawn = tuple["Axes", Panel, tuple[float, float]]  # axes, panel, and its size in points
 
 
-def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -> Figure:
+def plot_fit(result: Fit, *, width: str = TWO) -> Figure:
     """Draw stress-time, displacement-time and stress-strain, measured and fitted, and residuals.
 
     Panels without a curve are omitted. If the motion is prescribed, the loop is large and the input
     is not drawn. `width` is "one" or "two" columns, or a length such as "85 mm"; ", untitled" after
     it omits the title. Panels that do not fit side by side are stacked, and few panels make a
-    narrower figure. With `path`, the figure is saved in the format of its suffix.
+    narrower figure.
     """
     name = printable(" ".join(result.measurement.name.split()))
     name = name if len(name) <= 60 else name[:59] + "…"
@@ -51,7 +51,7 @@ def plot_fit(result: Fit, path: str | Path | None = None, *, width: str = TWO) -
     with panelled(panels_of(result), width, title, strips=True, known=known) as (figure, drawn):
         for ax, panel, extent in drawn:
             annotate(ax, panel, result, extent)
-    return figures.save(figure, path)
+    return figure
 
 
 def draw_panel(result: Fit, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
@@ -101,7 +101,7 @@ def plot_response(
 ) -> Figure:
     """Draw a forward run: base stress and displacements over time, stress over strain.
 
-    For `path` and `width` see `plot_fit`.
+    With `path`, the figure is saved in the format of its suffix; for `width` see `plot_fit`.
     """
     time, stress, nodes = response.time, response.base_stress, response.displacement
     end = response.contact_end
