@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import fabricated
 import foamfit as ff
 from conftest import (
     DATA,
@@ -120,6 +121,15 @@ def test_one_cycle_is_fitted_as_any_test(record, tmp_path, monkeypatch):
     content = json.loads((tmp_path / "out" / "fit.json").read_text())
     assert content["data"]["start_strain"] == pytest.approx(0.02, abs=1e-3)
     assert any("Contact of cycle 2 starts" in note for note in content["data"]["notes"])
+
+
+def test_cycles_of_different_models_are_one_table():
+    plain, relaxing = fabricated.microscale_result(), fabricated.microscale_result()
+    terms = {n: p for n, p in plain.parameters.items() if n not in ("s1_g1", "s1_tau1")}
+    fits = {1: replace(plain, parameters=terms), 2: relaxing}
+    *_, first, second = ff.CycleFits("foam", "auto", (1, 2), fits, {}).text().splitlines()
+    assert first.split()[-2:] == ["–", "–"]
+    assert "–" not in second
 
 
 # -------------------------------------------------------------------------------- measured foam
