@@ -37,7 +37,8 @@ def number(value: float | None) -> str:
     if isinstance(value, int):
         return str(value)
     if value == 0 or 1e-3 <= abs(value) < 1e6:
-        decimals = 0 if value == 0 else max(0, 3 - math.floor(math.log10(abs(value))))
+        rounded = float(f"{abs(value):.3e}")  # 999.96 is 1000, not 1000.0
+        decimals = 0 if value == 0 else max(0, 3 - math.floor(math.log10(rounded)))
         return f"{value:.{decimals}f}".replace("-", "−")
     return f"{value:.3e}".replace("-", "−")
 
