@@ -324,3 +324,15 @@ def test_a_fit_can_reach_the_contact_of_a_record_whose_rest_is_hard_to_see(given
     made = rig.impact(given, seed)
     contact = make_params(read_test(rig.write(made, tmp_path)))["contact_time"]
     assert contact.min < made.truth["contact_time"] < contact.max
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_slow_test_does_not_begin_where_its_motion_passes_an_arbitrary_zero(seed):
+    """The zero crossing, at 40 % of the loading, was taken for the contact of a soft foam."""
+    rng, time = np.random.default_rng(seed), np.linspace(-0.6, 20.0, 1030)
+    way = 1.0 - np.abs(time / 10.0 - 1.0)
+    stress = 1e5 * np.maximum(way, 0.0) ** 2 + 1e3 * rng.standard_normal(time.size)
+    motion = 5e-3 * (way - 0.4) + 1.5e-5 * rng.standard_normal(time.size)
+    test = condition(Record(time, stress, motion), SPECIMEN)
+    assert test.displacement.size > 900
+    assert not any("starts under load" in note for note in test.notes)

@@ -94,7 +94,7 @@ def test_rows_without_a_force_and_a_motion_are_counted(
     ("rows", "words"),
     [
         (["0 s,0 N,0 mm", *ROWS[1:]], "row 2, column 'time (s)' is '0 s'"),
-        (["N/A,N/A,N/A", *ROWS[1:]], "row 2, column 'time (s)' is 'N/A'"),
+        (["N/A,N/A,1", *ROWS[1:]], "row 2, column 'time (s)' is 'N/A'"),
         ([*ROWS[:30], "here,the,force", *ROWS[30:]], "row 32, column 'time (s)' is 'here'"),
         ([*ROWS, "max,200,4"], "row 203, column 'time (s)' is 'max'"),
         ([*ROWS[:30], "1.5,,1", *ROWS[31:]], "row 32, column 'force (N)' is empty"),

@@ -135,6 +135,8 @@ def test_a_staircase_becomes_its_ramp():
     assert np.abs(filled.displacement - w)[:-5].max() < 0.02 * np.abs(held - w).max()
     assert "5 samples" in filled.notes[0]
     assert np.flatnonzero(filled.sampled["displacement"]).tolist() == list(range(0, 1000, 5))
+    coarse = Record(t, w, np.round(w / 1e-6) * 1e-6)  # by a digitiser, several rows to a step
+    assert fill_staircase(coarse).displacement is coarse.displacement
 
 
 # Masses inside.

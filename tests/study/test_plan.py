@@ -225,6 +225,11 @@ def test_motions_inside_have_the_noise_of_the_rig(soft):
         levels = [record.noise.of(name) for name in ("displacement", "displacement_1")]
         assert levels[0].sigma == 0.0 < levels[1].sigma
         assert levels[1].given == (stated is not None)
+    several = replace(slow, cycles=3)
+    assert tomllib.loads(several.toml(test))["window"] == {"cycles": [1, 3]}
+    fast = replace(read_rig(None, test), sampling=1e6)  # for impacts
+    rows = several.weight(record.time, test, fast) * record.time.size
+    assert rows == pytest.approx(3 * test.displacement.size)
 
 
 def test_the_same_law_with_relaxation_is_a_rival(monkeypatch):

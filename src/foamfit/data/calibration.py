@@ -42,13 +42,15 @@ class Balance:
 
     `velocity` is that at contact, m/s; `force` is the factor by which the measured force must be
     multiplied, 1 if mass, force and motion agree; `delay` is that of the motion against the force,
-    s; `damping` is the η of an onsite damper of the striker, Pa s.
+    s; `damping` is the η of an onsite damper of the striker, Pa s; `scatter` is the standard
+    deviation of the motion about the fit, m.
     """
 
     velocity: Shown | None = None
     force: Shown | None = None
     delay: Shown | None = None
     damping: Shown | None = None
+    scatter: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -177,13 +179,18 @@ def balance(test: Measurement) -> Balance:
         return Balance(test.flight)
     begins = test.flight is not None or stress[0] <= _LOADED * float(stress.max())
     velocity, derived = fitted.velocity if begins and not integrated else None, test.derived
-    if velocity is None or "stress" in derived:
-        return Balance(velocity, None if "stress" in derived else fitted.force)
-    damped = _fitted(*given, damped=True) if contradictions(test, fitted) else None
+    if "stress" in derived:
+        return Balance(velocity, None)
+    plain = fitted if velocity is not None else Balance(None, fitted.force)
+    damped = _fitted(*given, damped=True)
     if damped is None or damped.damping is None or contradictions(test, damped):
-        return fitted
+        return plain
+    if not contradictions(test, fitted) and damped.scatter > 0.5 * fitted.scatter:
+        return plain
     size, error = damped.damping
-    return damped if size > BEYOND * error else fitted
+    if size <= BEYOND * error:
+        return plain
+    return damped if velocity is not None else Balance(None, damped.force, None, damped.damping)
 
 
 def _fitted(
@@ -233,7 +240,7 @@ def _fitted(
     error = math.hypot(errors[1], inertia * speed)
     force = factor, math.hypot(errors[2], inertia, summed)
     damping = (float(found[5]), float(errors[5])) if damped else None
-    return Balance((speed, error), force, (late, float(errors[4]) / factor), damping)
+    return Balance((speed, error), force, (late, float(errors[4]) / factor), damping, scatter)
 
 
 def _solved(

@@ -21,6 +21,7 @@ _ERRORS = 2.0  # standard errors added to the slope at rest
 # motion starts at zero (a rising stress is then contact); and if it starts away from zero, unless
 # there is no other rest.
 _DRIFT, _DRIFT_AT_ZERO, _DRIFT_AWAY = 0.01, 0.002, 0.06
+_TOUCHING = 0.03  # largest stress at a contact where the motion passes zero, as a share of the peak
 _APPROACH = 0.02  # share of its travel beyond which a machine without load is not in contact
 _BRAKED = 0.02  # share of the peak of a derived stress at which contact starts
 _SHARES = 0.025, 0.05, 0.1, 0.2  # shares of the peak up to which a rise is taken as straight
@@ -249,7 +250,8 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
     if at := leave_rest(time[: top + 1], w[: top + 1], levels["displacement"]):
         return replace(_at_kink("displacement", time, at, "motion"), gauge="rest")
     crossing = int(np.argmax(w >= 0.0))
-    if elsewhere and first < 0.0 < w[top] and stress[crossing] < 0.2 * peak:
+    load = float(stress[crossing] - np.median(stress[: crossing // 4 + 1]))
+    if elsewhere and first < 0.0 < w[top] and load < _TOUCHING * peak:
         how = "where the displacement passes zero"
         return Start(how, float(time[crossing]), crossing, by="motion", gauge="other")
     return _at_first(time)

@@ -19,7 +19,7 @@ from foamfit.data.noise import estimated_noise, noise_level, quantum, robust_var
 from foamfit.text import counted, engineering, percent
 
 # Spikes
-_OFF = 4.0  # least residual of an outlier, in standard deviations of leave-one-out residuals
+_RARE = 0.005  # probability that white noise alone shows an outlier in a record
 _ALONE = 2.5  # the same in standard deviations of its neighbours' residuals (large at a kink)
 _LEAST = 5e-3  # least residual of an outlier, as a share of the range
 _MOST = 0.02  # share of the samples: if more stand out, none is an outlier
@@ -104,14 +104,15 @@ def _gaps(values: Array, time: Array) -> Mask:
 def _spikes(values: Array, least: float, time: Array, weights: Array) -> Mask:
     """Find samples far from the cubic through their eight neighbours; see `_weights`."""
     from scipy.ndimage import maximum_filter1d
+    from scipy.special import ndtri
 
     out, own = np.zeros(values.size, dtype=bool), np.maximum(weights[:, _HALF], 1e-12)
     residual = np.einsum("ws,ws->w", weights, sliding_window_view(values, _WIDTH)) / own
     usual = np.sqrt(robust_variance(residual * np.sqrt(own)) / own)
-    size = np.abs(residual)
+    size, off = np.abs(residual), -ndtri(0.5 * _RARE / values.size)
     # A spike also increases the residuals of its neighbours: only the largest of five is one.
     largest = size >= maximum_filter1d(size, 5, mode="constant")
-    for i in np.flatnonzero((size > np.maximum(_OFF * usual, least)) & largest):
+    for i in np.flatnonzero((size > np.maximum(off * usual, least)) & largest):
         y, t = values[i : i + _WIDTH], time[i : i + _WIDTH] - time[i + _HALF]
         rest = np.polyfit(np.delete(t, _HALF), np.delete(y, _HALF), 3, full=True)[1][0]
         alone = np.sqrt(rest / (_WIDTH - 5) / own[i])
@@ -265,8 +266,17 @@ def fresh_samples(values: Array | Mask) -> tuple[Integers, Integers]:
 
 
 def is_staircase(values: Array) -> bool:
-    """Return whether most samples repeat the previous one."""
-    return bool(np.median(fresh_samples(values)[1]) >= 2)
+    """Return whether most samples repeat the previous one, and not for a coarse digitiser."""
+    fresh, lengths = fresh_samples(values)
+    return bool(np.median(lengths) >= 2) and not is_coarse(values[fresh])
+
+
+def is_coarse(fresh: Array) -> bool:
+    """Return whether a value usually changes by a single step of its digitiser."""
+    steps = np.abs(np.diff(fresh))
+    gaps = np.diff(np.unique(fresh))
+    gaps = gaps[gaps > 1e-6 * float(np.ptp(fresh))] if gaps.size else gaps
+    return bool(gaps.size and steps.size and np.median(steps) < 1.5 * gaps.min())
 
 
 def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
@@ -296,6 +306,8 @@ def fill_staircase(record: Record) -> Record:
         fresh, lengths = fresh_samples(values)
         step = int(np.median(lengths))
         if name == "stress" or name in record.sampled or len(lengths) < MIN_ROWS or step < 2:
+            continue
+        if is_coarse(values[fresh]):  # steps of the digitiser, not of a held value
             continue
         knots = np.union1d(fresh, (fresh + lengths - step)[lengths > 3 * step])
         label = "The displacement" if name == "displacement" else name

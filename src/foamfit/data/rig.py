@@ -186,8 +186,12 @@ class Candidate:
         )  # fmt: skip
 
     def weight(self, time: Array, test: Measurement, rig: Rig) -> float:
-        """Return the number of samples of the rig per simulated sample."""
-        if rig.sampling is not None:
+        """Return the number of samples of the rig per simulated sample.
+
+        A rate for impacts would be a thousand million rows in a slow test, which has as many per
+        cycle as the record at hand.
+        """
+        if rig.sampling is not None and self.mass is not None:
             return rig.sampling * float(time[-1] - time[0]) / time.size
         rows = test.rows.used if test.displacement is None else test.displacement.size
         return rows / max(len(test.cycles), 1) * self.cycles / time.size
@@ -211,6 +215,7 @@ class Candidate:
             lines.append(f'velocity = "{self.velocity:.6g} m/s"    # enter the measured velocity')
         else:
             lines += ["", f"# Machine: {self}."]
+            lines += ["[window]", f"cycles = [1, {self.cycles}]"] if self.cycles > 1 else []
         if self.interior:
             name = interior_channel(self.interior)
             lines.append(f"# Record the displacement of interior mass {self.interior} as {name}.")
