@@ -157,6 +157,15 @@ def test_rows_without_a_measured_number(tmp_path, missing):
     refused(path, "row 2", "'NaN'; it must be a finite number")
 
 
+def test_a_clock_coarser_than_the_rows(tmp_path):
+    """Averages of the rows with one stamp, one or several, had times off by half a step."""
+    coarse = rows(np.floor(TIME / 0.5) * 0.5, FORCE, MOTION)
+    test = read_test(write(tmp_path, ["time (s),force (N),displacement (mm)", *coarse]))
+    assert test.time.size >= N - 2
+    assert np.diff(test.time) == pytest.approx(TIME[1], rel=0.01)
+    assert any("clock is coarser than the rows" in note for note in test.notes)
+
+
 def test_a_thousandth_of_an_inch(tmp_path):
     body = rows(TIME, FORCE, MOTION / 0.0254)
     expect(read_test(write(tmp_path, ["time (s),force (N),displacement (mil)", *body])))

@@ -16,6 +16,8 @@ from foamfit.data.tables.signs import negative_channels
 from foamfit.data.units import LARGEST
 from foamfit.errors import InputError
 
+_COARSE = 0.1  # share of rows with the stamp of the row before, from which a clock is coarse
+
 
 @dataclass
 class Channels:
@@ -107,6 +109,12 @@ def _averaged(
     again = np.delete(rows, starts)
     if not again.size:
         return numbers, rows
+    if again.size > _COARSE * time.size and (even := _evenly(time)) is not None:
+        notes.append(
+            f"{again.size} of {time.size} rows have the time stamp of the row before: the clock is "
+            "coarser than the rows, which are even within its steps and are taken as even."
+        )
+        return numbers | {"time": even}, rows
     dropped.append(Dropped.of(again, "the time stamp of the row before, averaged with it"))
     notes.append(
         f"Check: {again.size} of {len(time)} rows have the time stamp of the row before, the first "
@@ -115,6 +123,15 @@ def _averaged(
     )
     averages = {channel: means(values, starts) for channel, values in numbers.items()}
     return averages | {"time": time[starts]}, rows[starts]
+
+
+def _evenly(time: Array) -> Array | None:
+    """Return even times for the stamps of a coarse clock; None if the rows are not even."""
+    places = np.arange(time.size)
+    slope, start = np.polyfit(places, time, 1)
+    even = start + slope * places
+    steps = np.diff(np.unique(time))
+    return even if np.ptp(time - even) < 1.2 * np.median(steps) else None
 
 
 def check_time(time: Array, name: str, rows: Integers) -> None:
