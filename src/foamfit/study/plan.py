@@ -128,8 +128,7 @@ def plan(
         progress(0.05 + 0.85 * i / len(asked), f"{counted(len(asked), 'candidate')}, {i} done")
         seen.append(look(known, one, limits, others))
 
-    fits = [one.fit for one in tests if one.fit is not None]
-    contradicted = known.missed > 0.0 and any(fit.contradictions for fit in fits)
+    contradicted = known.missed > 0.0 and _contradicted(tests)
 
     def outcome(one: Candidate, *more: Seen) -> Outcome:
         risk = np.any([each.broken for each in more], axis=0)
@@ -169,6 +168,11 @@ def plan(
 
 
 # ------------------------------------------------------------------ the tests at hand
+
+
+def _contradicted(tests: Sequence[Test]) -> bool:
+    """Return whether a test at hand contradicts its own record."""
+    return any(one.fit is not None and one.fit.contradictions for one in tests)
 
 
 def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
