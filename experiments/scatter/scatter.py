@@ -75,7 +75,7 @@ def page(frame: pd.DataFrame) -> None:
     """Write the page from all rows."""
     four, two = frame[frame.fitted == COUNT - 1], frame[frame.fitted == 2]
     ratio = four.half_width / four.half_width_simple
-    worst, t_alone = ratio.idxmax(), np.sqrt(1.0 + 1.0 / (COUNT - 1))
+    t_alone = np.sqrt(1.0 + 1.0 / (COUNT - 1))
     rows = (
         [r.specimen, percent(r.inside, 3), f"±{percent(r.half_width)}", percent(r.inside_simple, 3),
          f"±{percent(r.half_width_simple)}", f"{ratio[r.Index]:.2f}",
@@ -90,8 +90,7 @@ def page(frame: pd.DataFrame) -> None:
         HERE, rows=studies.lines(rows), two=studies.lines(pairs),
         inside=percent(float(np.average(four.inside, weights=four.samples)), 3),
         simple=percent(float(np.average(four.inside_simple, weights=four.samples)), 3),
-        median=ratio.median(), most=ratio.drop(worst).max(), worst=four.specimen[worst],
-        outlier=percent(four.inside_simple[worst]), few=len(four) - len(good), count=len(four),
+        median=ratio.median(), least=ratio.min(), most=ratio.max(), few=len(four) - len(good), count=len(four),
         rest=percent(good.inside.min(), 3),
     )  # fmt: skip
 
