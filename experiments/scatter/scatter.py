@@ -90,8 +90,8 @@ def page(frame: pd.DataFrame) -> None:
         HERE, rows=studies.lines(rows), two=studies.lines(pairs),
         inside=percent(float(np.average(four.inside, weights=four.samples)), 3),
         simple=percent(float(np.average(four.inside_simple, weights=four.samples)), 3),
-        median=ratio.median(), least=ratio.min(), most=ratio.max(), few=len(four) - len(good), count=len(four),
-        rest=percent(good.inside.min(), 3),
+        median=ratio.median(), least=ratio.min(), most=ratio.max(),
+        few=len(four) - len(good), count=len(four), rest=percent(good.inside.min(), 3),
     )  # fmt: skip
 
 
