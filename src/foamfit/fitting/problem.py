@@ -130,7 +130,7 @@ def fix_and_vary(
                 f"'{name}' is given by the specimen; leave [specimen] heights out to have it fitted"
             )
     for name, value in fix.items():
-        if not isinstance(value, Real) or not math.isfinite(value):
+        if not isinstance(value, Real):
             raise InputError(f"fix: {name} = {value!r} must be a number in SI units, like 5.5e6")
         params[name].set(value=float(value), vary=False, min=-math.inf, max=math.inf)
     for name in vary:
