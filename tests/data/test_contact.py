@@ -336,3 +336,21 @@ def test_a_slow_test_does_not_begin_where_its_motion_passes_an_arbitrary_zero(se
     test = condition(Record(time, stress, motion), SPECIMEN)
     assert test.displacement.size > 900
     assert not any("starts under load" in note for note in test.notes)
+
+
+@pytest.mark.parametrize("gravity", [9.80665, 0.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_force_and_motion_show_whether_the_striker_falls(gravity, seed):
+    """A slow drop on a linear spring; without gravity its stiffest part was fitted 6 % off."""
+    mass, speed, height, area, modulus = 2.0, 1.5, 20e-3, 1e-3, 5e5
+    omega, rng = np.sqrt(modulus * area / height / mass), np.random.default_rng(seed)
+    time = np.linspace(-0.2e-3, 29e-3, 800)
+    after = np.maximum(time, 0.0)
+    fall = gravity / omega**2 * (1.0 - np.cos(omega * after))
+    motion = np.where(time < 0.0, speed * time, fall + speed / omega * np.sin(omega * after))
+    stress = modulus / height * np.maximum(motion, 0.0)
+    curves = [one + 3e-3 * np.ptp(one) * rng.standard_normal(time.size) for one in (stress, motion)]
+    test = condition(Record(time, *curves), Specimen(height, area), striker=Striker(mass, speed))
+    assert test.striker.gravity == pytest.approx(gravity)
+    assert not any("does not show whether" in note for note in test.notes)
+    assert any("the striker" in note and "m/s²" in note for note in test.notes)

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import GRAVITY, INTEGRATED, Entry, Measurement, is_clipped
 from foamfit.data.noise import integrated_twice, residual_time, with_noise
+from foamfit.data.zeros import UNKNOWN_FALL
 from foamfit.text import engineering, rounded
 
 # Two numbers contradict each other if they differ by more than this many standard deviations. A
@@ -27,6 +28,7 @@ BEYOND, UNSTATED = 3.0, 0.01
 # Standard deviation of the zero of the force, as a share of its peak, and of the delay between
 # force and motion, as a share of the time under load.
 ZERO, DELAY = 0.01, 0.1
+AGREES = 2.0  # standard errors within which an acceleration is that of gravity, or none
 TENTH = 0.1  # of the limit: to this share a number in a line of the TOML is rounded
 LATE = 4.0  # standard errors of a delay beyond which the clocks of force and motion disagree
 _LOADED = 0.05  # largest stress at the first sample, as a share of the peak, if it is at contact
@@ -43,7 +45,8 @@ class Balance:
     `velocity` is that at contact, m/s; `force` is the factor by which the measured force must be
     multiplied, 1 if mass, force and motion agree; `delay` is that of the motion against the force,
     s; `damping` is the η of an onsite damper of the striker, Pa s; `scatter` is the standard
-    deviation of the motion about the fit, m.
+    deviation of the motion about the fit, m; `gravity` is the striker's acceleration by gravity,
+    m/s², if that is not known.
     """
 
     velocity: Shown | None = None
@@ -51,6 +54,7 @@ class Balance:
     delay: Shown | None = None
     damping: Shown | None = None
     scatter: float = 0.0
+    gravity: Shown | None = None
 
 
 @dataclass(frozen=True)
@@ -193,6 +197,28 @@ def balance(test: Measurement) -> Balance:
     return damped if velocity is not None else Balance(None, damped.force, None, damped.damping)
 
 
+def with_gravity(test: Measurement) -> Measurement:
+    """Decide by force and motion whether the striker falls, if neither TOML nor flight says it."""
+    striker, asked = test.striker, [note for note in test.notes if UNKNOWN_FALL in note]
+    if not asked or striker is None or striker.gravity is not None:
+        return test
+    shown = balance(test)
+    if shown.gravity is None or contradictions(test, shown):
+        return test
+    value, error = shown.gravity
+    falls, flies = (abs(value - one) <= AGREES * error for one in (GRAVITY, 0.0))
+    if falls == flies or 2.0 * AGREES * error > GRAVITY:
+        return test
+    note = (
+        f"Force and motion show that the striker {'falls' if falls else 'does not fall'}: gravity "
+        f"accelerates it by {value:.2g} ± {error:.1g} m/s². The fit takes "
+        f"{GRAVITY if falls else 0:g} m/s²."
+    )
+    notes = tuple(note if one in asked else one for one in test.notes)
+    striker = replace(striker, gravity=GRAVITY if falls else 0.0)
+    return replace(test, striker=striker, notes=notes)
+
+
 def _fitted(
     test: Measurement, mass: float, w: Array, stress: Array, time: Array, *, damped: bool = False
 ) -> Balance | None:
@@ -240,7 +266,9 @@ def _fitted(
     error = math.hypot(errors[1], inertia * speed)
     force = factor, math.hypot(errors[2], inertia, summed)
     damping = (float(found[5]), float(errors[5])) if damped else None
-    return Balance((speed, error), force, (late, float(errors[4]) / factor), damping, scatter)
+    delay = late, float(errors[4]) / factor
+    fall = (float(found[3]), math.hypot(errors[3], zero)) if gravity is None else None
+    return Balance((speed, error), force, delay, damping, scatter, fall)
 
 
 def _solved(

@@ -13,6 +13,7 @@ import numpy as np
 from foamfit.arrays import Array, means
 from foamfit.data import contact, cycles, frames, zeros
 from foamfit.data import outliers as repair
+from foamfit.data.calibration import with_gravity
 from foamfit.data.contact import Rise, rise_of
 from foamfit.data.measurement import (
     MEASURED,
@@ -125,7 +126,7 @@ def condition(
         step = float(np.median(np.diff(whole.time)))
         noise["displacement"] = noise_of_integral(whole.velocity, step)
     contact_time = whole.origins.get("contact_time", 0.0)
-    return _measured(
+    test = _measured(
         whole,
         record,
         block,
@@ -140,6 +141,7 @@ def condition(
         rise=rise and rise._replace(time=rise.time - contact_time),
         flight=flight,
     )
+    return with_gravity(test) if impact else test
 
 
 def _stated_of_blocks(stated: Noise, levels: contact.Levels, record: Record, block: int) -> Noise:

@@ -36,6 +36,7 @@ _HIGHEST = 0.1  # highest level of the end, as a share of the range
 _DRIFTS = 0.005  # share of its range by which a stress that drifts changes at least
 _MATTERS = 0.01  # relative gain of velocity in a fall above which gravity must be specified
 # Part of a note if motion and given velocity are inconsistent; the checklist searches for it.
+UNKNOWN_FALL = "does not show whether this one falls"  # part of a note
 CONTRADICTED = "but the striker's velocity is given as"
 
 
@@ -314,8 +315,7 @@ def flight_of(
     if striker.gravity is None and share > _MATTERS:
         notes.append(
             f"Check: a falling striker gains {gain} of its velocity over the contact, but the "
-            "record does not show whether this one falls; write gravity = true or false under "
-            "[striker]."
+            f"record {UNKNOWN_FALL}; write gravity = true or false under [striker]."
         )
     return striker, flight, notes
 
