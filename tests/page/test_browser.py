@@ -50,7 +50,7 @@ MOVE = f"""(steps) => {{
 # Store in `seen` whether the sliders ever took no input.
 WATCH = f"""() => {{
   window.seen = false;
-  setInterval(() => {{ window.seen ||= ({SLIDER})().closest('.list').inert; }}, 2);
+  setInterval(() => {{ window.seen ||= ({SLIDER})()?.closest('.list').inert; }}, 2);
 }}"""
 # Send the events of dropping external files to an element.
 DROP = """(beneath, files) => {
@@ -336,7 +336,7 @@ def test_sliders_about_to_be_replaced_cannot_be_moved(window):
     window.evaluate(WATCH)
     window.get_by_label("Model:").select_option("bistable+bistable")
     window.get_by_label("s2_k0", exact=True).wait_for()
-    window.wait_for_function(f"!({SLIDER})().closest('.list').inert")
+    window.wait_for_function(f"({SLIDER})()?.closest('.list').inert === false")
     assert window.evaluate("window.seen")
 
 
