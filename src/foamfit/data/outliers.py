@@ -268,10 +268,10 @@ def fresh_samples(values: Array | Mask) -> tuple[Integers, Integers]:
 def is_staircase(values: Array) -> bool:
     """Return whether most samples repeat the previous one, and not for a coarse digitiser."""
     fresh, lengths = fresh_samples(values)
-    return bool(np.median(lengths) >= 2) and not is_coarse(values[fresh])
+    return bool(np.median(lengths) >= 2) and not _is_coarse(values[fresh])
 
 
-def is_coarse(fresh: Array) -> bool:
+def _is_coarse(fresh: Array) -> bool:
     """Return whether a value usually changes by a single step of its digitiser."""
     steps = np.abs(np.diff(fresh))
     gaps = np.diff(np.unique(fresh))
@@ -305,9 +305,8 @@ def fill_staircase(record: Record) -> Record:
     for name, values in record.curves().items():
         fresh, lengths = fresh_samples(values)
         step = int(np.median(lengths))
-        if name == "stress" or name in record.sampled or len(lengths) < MIN_ROWS or step < 2:
-            continue
-        if is_coarse(values[fresh]):  # steps of the digitiser, not of a held value
+        known = name == "stress" or name in record.sampled
+        if known or len(lengths) < MIN_ROWS or not is_staircase(values):
             continue
         knots = np.union1d(fresh, (fresh + lengths - step)[lengths > 3 * step])
         label = "The displacement" if name == "displacement" else name

@@ -172,10 +172,12 @@ class Objective:
             return 1.0
         return 1.0 - 1.0 / math.sqrt(1.0 + self._kept[name].size * (error * self.factor(name)) ** 2)
 
-    def offset(self, name: str, curve: Array) -> float:
-        """Return the zero of an interior motion in view of its simulated curve, m; else 0."""
-        miss = (self.measured[name] - curve)[self._kept[name]]
-        return self._unzeroed.get(name, 0.0) * float(miss.mean())
+    def as_read(self, name: str, curve: Array) -> Array:
+        """Return a simulated curve, that of an interior motion with the zero of its gauge, SI."""
+        share = self._unzeroed.get(name)
+        if not share:
+            return curve
+        return curve + share * float((self.measured[name] - curve)[self._kept[name]].mean())
 
     def thinned(self) -> Objective:
         """Return the objective of a few hundred samples, or this one if it has no more.
@@ -447,5 +449,5 @@ class Objective:
         measured, simulated = self.measured.get(name), curves.curves.get(name)
         if measured is None or simulated is None:
             return None
-        miss = (simulated + self.offset(name, simulated) - measured)[self._kept[name]]
+        miss = (self.as_read(name, simulated) - measured)[self._kept[name]]
         return float(np.sqrt(np.mean(miss**2)) / np.ptp(measured))

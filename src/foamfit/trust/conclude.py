@@ -60,11 +60,6 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
     late = best.value(TIME_SHIFT) if objective.time_shift else 0.0
     on_time = changed(measurement, TIME_SHIFT, late) if late else measurement
     balance, misfit = audit(on_time), objective.misfit(simulated)
-    inner = {
-        node: (measurement.interior[node], curve + objective.offset(name, curve))
-        for name, node in objective.interior.items()
-        for curve in [simulated.curves[name]]
-    }
     contradictions = unsettled(best, balance.contradictions)
     settled = settle(best, contradictions)
     estimates, budget = make_budget(best, _estimates(best, insight, intervals, settled))
@@ -94,7 +89,10 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
             stress=simulated.curves.get("stress_time"),
             displacement=simulated.curves.get("displacement_time"),
             stress_along=simulated.curves.get("stress_strain"),
-            interior=inner,
+            interior={
+                node: (measurement.interior[node], objective.as_read(name, simulated.curves[name]))
+                for name, node in objective.interior.items()
+            },
         ),
         switches=_switches(best),
         correlation=correlation,
@@ -132,8 +130,8 @@ def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[st
     objective, out = best.problem.objective, {}
     pairs = zip(objective.rms(best.residual).items(), errors or repeat(None), strict=False)
     for (name, rms), error in pairs:
-        curve = best.simulated.curves[name]
-        residual = curve + objective.offset(name, curve) - objective.measured[name]
+        curve = objective.as_read(name, best.simulated.curves[name])
+        residual = curve - objective.measured[name]
         level = objective.noise(name)
         out[name] = asdict(level) | {
             "scale": objective.scale[name],

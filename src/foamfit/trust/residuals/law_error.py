@@ -173,29 +173,41 @@ def curve_errors(
     leaves in another, more exact one, if it does not weigh both by their noise: what a fit by the
     noise would take away is no model error (one test alone).
     """
-    basis = basis_of(jacobian) if taken is None else taken
     own = noise_processes(residual, jacobian, sizes, taken)
-    found = tuple(
-        CurveError(process) if driven else _curve_error(residual[part], basis[part], process)
-        for part, process in zip(parts(sizes), own, strict=True)
-    )
+    if driven:
+        return tuple(map(CurveError, own))
+    basis = basis_of(jacobian) if taken is None else taken
+    found = _separated(residual, basis, sizes, own)
     errs = [error.found for error in found]
     if taken is not None or all(errs) or not any(errs):
         return found
-    units = np.ones(residual.size)
-    for part, error in zip(parts(sizes), found, strict=True):
-        units[part] = max(math.sqrt(error.noise.variance), 1e-300)
+    return _without_noise_of_others(residual, jacobian, sizes, found)
+
+
+def _separated(
+    residual: Array, basis: Array, sizes: tuple[int, ...], own: list[NoiseProcess]
+) -> tuple[CurveError, ...]:
+    """Separate noise and model error in each curve; `own` is all of it as noise."""
+    pairs = zip(parts(sizes), own, strict=True)
+    return tuple(_curve_error(residual[part], basis[part], process) for part, process in pairs)
+
+
+def _without_noise_of_others(
+    residual: Array, jacobian: Array, sizes: tuple[int, ...], found: tuple[CurveError, ...]
+) -> tuple[CurveError, ...]:
+    """Return `found` without the model error that a fit weighted by the noise would take away."""
+    scales = [max(math.sqrt(error.noise.variance), 1e-300) for error in found]
+    units = np.ones(residual.size)  # those of priors
+    units[: sum(sizes)] = np.repeat(scales, sizes)
     left, slopes = residual / units, jacobian / units[:, None]
-    axes = basis_of(slopes)
-    left -= axes @ (axes.T @ left)
-    own = noise_processes(left, slopes, sizes)
-    again = (_curve_error(left[p], axes[p], one) for p, one in zip(parts(sizes), own, strict=True))
-    firsts = [units[part.start] for part in parts(sizes)]
+    basis = basis_of(slopes)
+    left -= basis @ (basis.T @ left)
+    again = _separated(left, basis, sizes, noise_processes(left, slopes, sizes))
     return tuple(
-        CurveError(replace(new.noise, variance=new.noise.variance * unit**2), new.evidence)
+        CurveError(replace(new.noise, variance=new.noise.variance * scale**2), new.evidence)
         if error.found and not new.found
         else error
-        for error, new, unit in zip(found, again, firsts, strict=True)
+        for error, new, scale in zip(found, again, scales, strict=True)
     )
 
 
