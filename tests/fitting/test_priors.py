@@ -30,6 +30,11 @@ def test_a_prior_draws_the_value_and_narrows_the_interval(impact: ff.Measurement
     assert found.stderr == pytest.approx(math.hypot(1 / sigma, 1 / alone.stderr) ** -1, rel=0.05)
     assert result.to_json_dict()["priors"] == {"s1_k0": [mean, sigma]}
     assert any(note.startswith("Prior of s1_k0: ") for note in result.notes)
+    assert "priors" not in {check.key for check in result.checklist if check.answer is False}
+    far = (alone.value + 5.0 * alone.stderr, 0.1 * alone.stderr)
+    against = ff.fit(impact, priors={"s1_k0": far}, **OPTIONS)
+    [said] = [text for text in against.warnings if "contradict the prior of s1_k0" in text]
+    assert "5.9" in said  # MPa; the curves alone, 5.54 ± 0.28, to first order
     free = ff.fit(impact, priors={"s1_k0": f"{mean / 1e6} ± 1e9 MPa"}, **OPTIONS)
     assert free.parameters["s1_k0"].value == pytest.approx(alone.value, rel=1e-6)
 

@@ -23,7 +23,7 @@ from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.search import SearchRecord
 from foamfit.parts import ParameterEstimate
 from foamfit.results import Check, Intervals
-from foamfit.springs.parameters import NUISANCE, any_param, split_name
+from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 from foamfit.trust import SENTENCES, say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import AT_LIMIT, WEAK, covariance
@@ -37,6 +37,8 @@ POOR = 0.05
 STATED, ESTIMATED = 1.1, 1.5
 # Relative fall of the misfit by free contact and zeros that is not due to noise.
 BOUGHT = 0.02
+# The curves contradict a prior if they differ by more than this many standard deviations of both.
+AGAINST = 3.0
 # Residuals are correlated if their autocorrelation time, in samples, exceeds this.
 STRUCTURED = 5.0
 # Largest number of reasons in a warning; more are easier to read in the table of parameters.
@@ -90,12 +92,13 @@ def make_checklist(
         _determined(best, estimates),
         _visited(best, estimates),
         *_of_intervals(best, estimates, intervals, with_error),
+        *_of_priors(best, estimates, with_error),
         *_of_test(best, balance, contradictions),
         _time_shift(best, estimates, contradictions),
         _damping(best, with_error),
     )
     by_key = {check.key: check for check in checks}
-    return tuple(by_key[key] for key in SENTENCES["check"])
+    return tuple(by_key[key] for key in SENTENCES["check"] if key in by_key)
 
 
 def _check(key: str, answer: bool | None, *, fatal: bool = False, **facts: Any) -> Check:
@@ -233,6 +236,32 @@ def _of_intervals(
             else:
                 stuck.append((name, bound))
     yield _check("bounds", not stuck, stuck=stuck, natural=natural)
+
+
+def _of_priors(best: BestPoint, estimates: Estimates, with_error: Sequence[str]) -> Iterator[Check]:
+    """Check whether the curves alone agree with each prior of the user, if there are any.
+
+    The value without a prior is one linear step away from the best point.
+    """
+    problem, against = best.problem, list[dict[str, Any]]()
+    given = [prior for prior in problem.objective.given if prior.name in with_error]
+    sizes = problem.sizes(tuple(with_error), best.values)
+    columns = best.jacobian[:, [*map(best.names.index, with_error)]]
+    for prior in given:
+        place = with_error.index(prior.name)
+        others = np.arange(len(columns)) != (
+            problem.objective.n_data + problem.objective.priors.index(prior)
+        )
+        rows, residual = columns[others], best.residual[others]
+        move = sizes * np.linalg.lstsq(rows * sizes, -residual, rcond=1e-10)[0]
+        error = float(covariance(rows, residual, problem.objective.sizes, sizes).stderr[place])
+        low, high = estimates[prior.name].range or (0.0, 0.0)
+        error, alone = max(error, 0.25 * (high - low)), best.value(prior.name) + float(move[place])
+        if abs(alone - prior.mean) > AGAINST * math.hypot(prior.sigma, error):
+            told = {"prior": prior, "alone": alone, "error": error, "unit": unit_of(prior.name)}
+            against.append(told)
+    if given:
+        yield _check("priors", not against, against=against)
 
 
 def _of_test(
