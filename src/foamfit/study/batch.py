@@ -12,6 +12,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Unpack
 
+import numpy as np
+
 from foamfit.data.toml_file import toml_beside
 from foamfit.errors import InputError, check_whole
 from foamfit.files import is_left, reason, sweep
@@ -211,8 +213,10 @@ def batch(
         If the call is wrong, or a result cannot be written (full disk).
     """
     numbers = () if cycle == "all" else cycle
-    if numbers is not None and not isinstance(numbers, int):
-        numbers = tuple(int(number) for number in numbers)
+    if isinstance(numbers, int | np.integer):
+        numbers = int(numbers)
+    elif numbers is not None:
+        numbers = tuple(map(int, numbers))
     chosen = Options.of("batch", options)
     named = _checked(model, chosen)
     recipe = Recipe(named, vars(chosen), numbers, report, figure_width, history=cycles)
