@@ -20,6 +20,8 @@ UPDATES, PREDICTED = 6, 0.5
 # A descent ends where a step fails whose predicted gain is below this multiple of `least`: it is of
 # the size of errors of the simulation.
 LITTLE = 100.0
+# A failed step is followed by one of at least about this fraction of its length.
+SHORTEST = 0.1
 # Damping of the trial steps in `following`.
 FOLLOWING = (1e-9, 1e-6, 1e-3, 0.1)
 
@@ -112,12 +114,13 @@ def descend(
     The Jacobian of a `stale` one is that of a nearby point.
 
     A coordinate at a limit whose gradient points outwards is fixed for the step. The damping
-    follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). The descent ends after two consecutive
-    steps that lower the cost by less than the fraction `enough`, when the predicted gain is below
-    `least`, or when a step fails that promised little more. Points with an infinite residual are
-    rejected; the start must have a finite one. A dense Jacobian, that of a single test, is updated
-    while steps gain what it predicts; a descent ends with an exact one unless it runs out of
-    `iterations`.
+    follows the gain ratio (Nielsen 1999, IMM-REP-1999-05). A failed step is followed by one that
+    ends about where the parabola through its cost, and through the cost and slope at the point, has
+    its minimum (Dennis & Schnabel 1983, 6.3.2). The descent ends after two consecutive steps that
+    lower the cost by less than the fraction `enough`, when the predicted gain is below `least`, or
+    when a step fails that promised little more. Points with an infinite residual are rejected; the
+    start must have a finite one. A dense Jacobian, that of a single test, is updated while steps
+    gain what it predicts; a descent ends with an exact one unless it runs out of `iterations`.
     """
     low, high = box
     fixed = low == high
@@ -150,7 +153,9 @@ def descend(
                     updates, at = 0, Iterate(trial, found, jacobian(trial))
                 continue
             if not updates:
-                damping *= growth
+                slope = -2.0 * float(at.gradient @ moved)
+                part = 0.5 * slope / max(slope - gain, 1e-300)
+                damping *= max(growth, 1.0 / min(max(part, SHORTEST), 0.5) ** 2)
                 growth *= 2.0
                 little = at.expected(step) < LITTLE * least
                 ended = little or damping > 1e8 or float(np.max(np.abs(moved))) < 1e-9

@@ -54,7 +54,7 @@ ALIKE = 1e-3  # relative difference of the costs of descents that ended in one m
 PROMISING = 100.0
 # Stages of successive halving: iterations, the share of the starts that then goes on, and that of
 # the work.
-STAGES = ((12, 0.5, 0.5), (12, 0.25, 0.25), (36, 0.25, 0.25))
+STAGES = ((8, 0.5, 0.5), (8, 0.25, 0.25), (24, 0.25, 0.25))
 HALFWAY = STAGES[0][2]
 LEAST = 6  # descents that go on in any case
 FEWER = 4  # divisor of the number of starts if a poorer model has found good ones
