@@ -5,11 +5,13 @@ from __future__ import annotations
 import functools
 import gc
 import os
+import pickle
 import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +138,15 @@ def write_csv(path: Path, head: str, *columns: Any, fmt: str = "%.9g", toml: str
     return path
 
 
+def write_lines(folder: Path, lines: list[str], toml: str | None = SPECIMEN, **form: Any) -> Path:
+    """Write test.csv with these lines, in UTF-8 unless `form` differs, and a TOML beside it."""
+    path = folder / "test.csv"
+    path.write_text("\n".join(lines) + "\n", **{"encoding": "utf-8"} | form)
+    if toml is not None:
+        path.with_suffix(".toml").write_text(toml, encoding="utf-8")
+    return path
+
+
 def write_measurement(path: Path, test: Measurement, more: str = "") -> Path:
     """Write a test as CSV and TOML, with more lines of TOML at the end."""
     columns = {"time (s)": test.time, "stress (Pa)": test.stress}
@@ -218,6 +229,13 @@ def synthetic_impact(
     )  # fmt: skip
 
 
+def assert_near(found: ff.FitResult, truth: dict[str, float], errors: float) -> None:
+    """Check that springs have the true parameters within this number of standard errors."""
+    for name, value in truth.items():
+        one = found.parameters[f"s1_{name}"]
+        assert abs(one.value - value) < errors * one.stderr, name
+
+
 def refused(path: Path, *words: str, specimen: Path | None = None) -> None:
     """Check that a test is rejected with one sentence that contains these words."""
     with pytest.raises(ff.InputError) as caught:
@@ -246,3 +264,16 @@ def loop_measurement(
     return Measurement(
         "synthetic loop", None, "", time, stress, motion, specimen, motion="measured"
     )
+
+
+class Inline(Executor):
+    """An executor that calls in this process, with arguments pickled as for another process."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future = Future[Any]()
+        try:
+            there, given, named = pickle.loads(pickle.dumps((fn, args, kwargs)))
+            future.set_result(there(*given, **named))
+        except Exception as error:
+            future.set_exception(error)
+        return future

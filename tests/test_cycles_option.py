@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import run, run_refused, write_csv
+from conftest import Inline, run, run_refused, write_csv
 from foamfit import Chain
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
 from foamfit.fitting.curves import default_weights
 from foamfit.fitting.objective import Objective
 from foamfit.springs.model import Model
-from inline import Inline
 
 TRUTH = ff.MicroscaleSpring(
     5e5, 3e5, 0.25, 1.2e5, 0.4, 5.5e4, 0.6, stiffening=1.8, softening=0.7, weakening=0.4

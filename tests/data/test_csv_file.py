@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from conftest import DATA, HEADER, SPECIMEN, needs_data, refused, specimen_toml
+from conftest import DATA, HEADER, SPECIMEN, needs_data, refused, specimen_toml, write_lines
 from foamfit.data.csv_file import read_test
 
 LOOP = np.sin(np.linspace(0, np.pi, 41))  # loading from 0 to 1 and unloading to 0
@@ -19,11 +19,7 @@ def numbers(separator=",", decimal="."):
 
 def write(folder, header=HEADER, rows=None, toml=SPECIMEN):
     rows = numbers() if rows is None else rows
-    path = folder / "test.csv"
-    path.write_text("\n".join([*([header] if header else []), *rows]) + "\n", encoding="utf-8")
-    if toml is not None:
-        path.with_suffix(".toml").write_text(toml, encoding="utf-8")
-    return path
+    return write_lines(folder, [header, *rows], toml)
 
 
 def expect(test):

@@ -6,7 +6,7 @@ The records are synthetic: a force at 100 kHz and camera frames at 10 kHz.
 import numpy as np
 import pytest
 
-from conftest import SPECIMEN, STRIKER, refused
+from conftest import SPECIMEN, STRIKER, refused, write_csv
 from foamfit.data.csv_file import read_test
 from foamfit.data.frames import Frames, join
 from foamfit.data.measurement import Record
@@ -28,8 +28,7 @@ def press(t):
 
 
 def table(path, **columns):
-    rows = np.column_stack([*columns.values()])
-    np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="")
+    write_csv(path, ",".join(columns), *columns.values(), fmt="%.18e")
 
 
 def written(folder, toml=MOTION, rate=1e5, frames=None, motion=None, force=None):

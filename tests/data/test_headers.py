@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import SPECIMEN, refused
+from conftest import SPECIMEN, refused, write_lines
 from foamfit.data.csv_file import read_test
 
 T = np.linspace(0.0, 10.0, 201)
@@ -16,13 +16,6 @@ F = 50.0 * W
 PLAIN = "time (s),force (N),displacement (mm)"
 ROWS = [f"{t:.9g},{f:.9g},{w:.9g}" for t, f, w in zip(T, F, W, strict=True)]
 FIRST, NAMES = "Compression of a foam, sample 3", "Time,Force,Displacement"
-
-
-def written(folder: Path, lines: list[str], end: str = "\n", encoding: str = "utf-8") -> Path:
-    path = folder / "test.csv"
-    path.write_bytes((end.join(lines) + end).encode(encoding))
-    path.with_suffix(".toml").write_text(SPECIMEN)
-    return path
 
 
 @pytest.mark.parametrize(
@@ -45,14 +38,17 @@ def test_a_header_may_have_several_rows(
     tmp_path: Path, head: list[str], end: str, encoding: str
 ) -> None:
     lines = [line.replace("\n", end) for line in head]
-    test = read_test(written(tmp_path, [*lines, *ROWS], end, encoding))
+    test = read_test(write_lines(tmp_path, [*lines, *ROWS], newline=end, encoding=encoding))
     assert (test.rows.rows, test.rows.used) == (T.size, T.size)
     assert test.stress.max() == pytest.approx(2e6)
     assert test.displacement.max() == pytest.approx(4e-3)
     assert test.time[-1] == pytest.approx(10.0)
     broken = [*ROWS[:7], "0.35,x,1", *ROWS[8:]]
     count = sum(line.count("\n") + 1 for line in head)
-    refused(written(tmp_path, [*lines, *broken], end, encoding), f"row {count + 8}, column")
+    refused(
+        write_lines(tmp_path, [*lines, *broken], newline=end, encoding=encoding),
+        f"row {count + 8}, column",
+    )
 
 
 @pytest.mark.parametrize(
@@ -84,7 +80,7 @@ def test_a_workbook_in_another_format_can_be_saved_as_a_table(
 def test_rows_without_a_force_and_a_motion_are_counted(
     tmp_path: Path, rows: list[str], unused: int
 ) -> None:
-    test = read_test(written(tmp_path, [PLAIN, *rows]))
+    test = read_test(write_lines(tmp_path, [PLAIN, *rows]))
     assert (test.rows.rows, test.rows.used) == (T.size + unused, T.size)
     (item,) = test.rows.dropped
     assert (item.rows, item.why) == (unused, "no numbers in the columns in use")
@@ -109,4 +105,4 @@ def test_rows_without_a_force_and_a_motion_are_counted(
 def test_samples_that_are_not_numbers_are_refused_by_row(
     tmp_path: Path, rows: list[str], words: str
 ) -> None:
-    refused(written(tmp_path, [PLAIN, *rows]), words)
+    refused(write_lines(tmp_path, [PLAIN, *rows]), words)

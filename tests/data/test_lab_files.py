@@ -5,11 +5,12 @@ The layouts are those of the instruments; all values are synthetic.
 
 import gzip
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
 
-from conftest import SPECIMEN, STRIKER, refused, run, run_refused
+from conftest import SPECIMEN, STRIKER, refused, run, run_refused, write_lines
 from foamfit.data.csv_file import read_test
 
 COLUMNS = SPECIMEN + "[columns]\n"
@@ -19,18 +20,12 @@ LOOP = np.sin(np.linspace(0, np.pi, N))
 TURN = np.arange(N) > N // 2
 FORCE = 200 * LOOP * np.where(TURN, LOOP, 1.0)  # N, up to 2 MPa; lower in unloading
 MOTION = 4 * LOOP  # mm
+write = partial(write_lines, newline="\r\n")
 
 
 def rows(*columns, sep=",", decimal=".", form=".6f"):
     lines = (sep.join(format(v, form) for v in row) for row in zip(*columns, strict=True))
     return [line.replace(".", decimal) for line in lines]
-
-
-def write(folder, lines, toml=SPECIMEN, name="test.csv", encoding="utf-8"):
-    path = folder / name
-    path.write_bytes(("\r\n".join(lines) + "\r\n").encode(encoding))
-    (folder / "test.toml").write_text(toml, encoding="utf-8")
-    return path
 
 
 def expect(test, time=TIME[-1]):

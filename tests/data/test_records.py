@@ -8,6 +8,7 @@ import pytest
 
 import fabricated
 from conftest import HEADER, SPECIMEN, STRIKER, refused, run
+from conftest import write_lines as write
 from foamfit.data.calibration import contradictions
 from foamfit.data.csv_file import read_test
 from foamfit.data.energy import audit
@@ -15,13 +16,6 @@ from foamfit.errors import InputError
 from foamfit.fitting.curves import check_drive
 from foamfit.report.described import describe
 from foamfit.report.summary import render_report, summary_text
-
-
-def write(folder, lines, toml=SPECIMEN):
-    path = folder / "test.csv"
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    path.with_suffix(".toml").write_text(toml, encoding="utf-8")
-    return path
 
 
 def table(*columns, header=HEADER):

@@ -21,14 +21,13 @@ import pytest
 
 import fabricated
 import foamfit as ff
-from conftest import HEIGHT, run, run_refused, synthetic_impact, write_csv
+from conftest import HEIGHT, Inline, run, run_refused, synthetic_impact, write_csv
 from foamfit.cli import many as command
 from foamfit.report.listing import Row, row_of, write_comparison, write_page
 from foamfit.study import batch as module
 from foamfit.study import batch_work
 from foamfit.study.batch_work import work
 from foamfit.terminal import TerminatedError
-from inline import Inline
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 QUICK = {"starts": 2, "intervals": "local"}  # a search from one start explores longer
