@@ -1,28 +1,22 @@
-"""Chains of linear springs against closed forms; the judge of experiments/stability as well."""
+"""Chains of linear springs against closed forms."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
 import foamfit as ff
-import independent
-from independent import follow, over_range
+from independent import over_range
 
 AREA, H, MASS, SPEED = 2e-5, 1e-3, 7e-3, 2.0
 K, RATE = 3e6, 1e10
 
 
-def simulated(chain: ff.Chain, drive: Any, time: np.ndarray) -> ff.Response:
+def run(chain: ff.Chain, drive: Any, time: np.ndarray) -> ff.Response:
     return ff.simulate(chain, drive, time, rtol=1e-10)
-
-
-EACH = pytest.mark.parametrize("by", [simulated, follow])
-By = Callable[[ff.Chain, Any, np.ndarray], Any]
 
 
 def line(k: float = K, eta: float = 0.0) -> ff.LinearSpring:
@@ -33,9 +27,8 @@ def chain(*springs: Any, masses: list[float] | None = None, site: float = 0.0) -
     return ff.Chain(springs, [H] * len(springs), AREA, masses, site)
 
 
-@EACH
 @pytest.mark.parametrize(("eta", "onsite"), [(0.0, False), (60.0, False), (60.0, True)])
-def test_a_striker_is_thrown_back(by: By, eta: float, onsite: bool) -> None:
+def test_a_striker_is_thrown_back(eta: float, onsite: bool) -> None:
     """m w″ + c w′ + k w = 0; contact ends where the stress of spring and dashpot is zero."""
     omega, decay = math.sqrt(K * AREA / (MASS * H)), 0.5 * eta * AREA / (MASS * H)
     ring = math.sqrt(omega**2 - decay**2)
@@ -43,7 +36,7 @@ def test_a_striker_is_thrown_back(by: By, eta: float, onsite: bool) -> None:
     end = (math.pi - math.atan2(carried * ring, K - carried * decay)) / ring
     time = np.linspace(0.0, 1.3 * math.pi / omega, 77)
     own = chain(line(eta=carried), site=eta if onsite else 0.0)
-    got, held = by(own, ff.Impact(MASS, SPEED), time), time < end
+    got, held = run(own, ff.Impact(MASS, SPEED), time), time < end
     fades = SPEED * np.exp(-decay * time)
     w = fades / ring * np.sin(ring * time)
     rate = fades * (np.cos(ring * time) - decay / ring * np.sin(ring * time))
@@ -52,58 +45,40 @@ def test_a_striker_is_thrown_back(by: By, eta: float, onsite: bool) -> None:
     assert over_range(got.base_stress, np.where(held, (K * w + carried * rate) / H, 0.0)) <= 1e-10
 
 
-@EACH
-def test_creep_under_a_rising_stress(by: By) -> None:
+def test_creep_under_a_rising_stress() -> None:
     eta = 50.0
     time = np.linspace(0.0, 5.0 * eta / K, 30)
     drive = ff.StressDrive(RATE * time)
     creep = RATE / K * (time + eta / K * np.expm1(-K * time / eta))
-    got = by(chain(line(eta=eta), line(2.0 * K)), drive, time)
+    got = run(chain(line(eta=eta), line(2.0 * K)), drive, time)
     assert over_range(got.displacement[0], H * creep) <= 1e-10
     assert over_range(got.displacement[1], H * (creep + RATE * time / (2.0 * K))) <= 1e-10
     # a damper between the top and the ground has the same motion, and takes its part of the load
-    got = by(chain(line(), site=eta), drive, time)
+    got = run(chain(line(), site=eta), drive, time)
     assert over_range(got.displacement[0], H * creep) <= 1e-10
     assert over_range(got.base_stress, K * creep) <= 1e-10
 
 
-@EACH
-def test_a_spring_and_a_dashpot_share_a_ramp_of_displacement(by: By) -> None:
+def test_a_spring_and_a_dashpot_share_a_ramp_of_displacement() -> None:
     eta, pace, time = 50.0, 1e-2, np.linspace(0.0, 1e-4, 40)
-    got = by(chain(line(eta=eta), line(2.0 * K)), ff.DisplacementDrive(pace * time), time)
+    got = run(chain(line(eta=eta), line(2.0 * K)), ff.DisplacementDrive(pace * time), time)
     rate, slope = 3.0 * K / eta, 2.0 * K * pace / (H * eta)  # η ε′ = 2k (pace t/h - ε) - k ε
     eps = slope * (time / rate + np.expm1(-rate * time) / rate**2)
     assert over_range(got.displacement[0], H * eps) <= 1e-9
     assert over_range(got.base_stress, 2.0 * K * (pace * time / H - eps)) <= 1e-9
 
 
-@EACH
-def test_a_mass_on_a_spring_and_between_two(by: By) -> None:
+def test_a_mass_on_a_spring_and_between_two() -> None:
     mass, pace = 5e-4, 1.0
     omega = math.sqrt(K * AREA / (H * mass))
     time = np.linspace(0.0, 20.0 / omega, 120)
-    got = by(chain(line(), masses=[mass]), ff.StressDrive(RATE * time), time)
+    got = run(chain(line(), masses=[mass]), ff.StressDrive(RATE * time), time)
     assert (
         over_range(got.displacement[0], H * RATE / K * (time - np.sin(omega * time) / omega))
         <= 1e-9
     )
     omega *= math.sqrt(2.0)
-    got = by(chain(line(), line(), masses=[mass, 0.0]), ff.DisplacementDrive(pace * time), time)
+    got = run(chain(line(), line(), masses=[mass, 0.0]), ff.DisplacementDrive(pace * time), time)
     w = 0.5 * pace * (time - np.sin(omega * time) / omega)
     assert over_range(got.displacement[0], w) <= 1e-9
     assert over_range(got.base_stress, K * w / H) <= 1e-9
-
-
-def test_the_judge_has_no_say_where_the_law_leaves_open_which_spring_moves() -> None:
-    """Two gaps or two flat branches under one stress: only the sum of the strains is determined."""
-    time = np.linspace(0.0, 1.0, 11)
-    pull = ff.DisplacementDrive(1e-5 * time)
-    flat = ff.BistableSpring(2e6, 6e7, -1e5, 0.2, 0.5, 0.0, 1e6)
-    for spring, sure in (
-        (ff.LinearSpring(6e7, unilateral=True), False),
-        (flat, False),
-        (line(), True),
-    ):
-        assert (follow(chain(spring, spring), pull, time).why == "") == sure
-        apart = follow(chain(spring, spring, masses=[1e-3, 0.0]), pull, time, most=10_000)
-        assert apart.why != independent.SHARED
