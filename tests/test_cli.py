@@ -42,12 +42,11 @@ def accepted(*args: object) -> Result:
 
 def refused(folder: Path, *args: object, words: tuple[str, ...]) -> None:
     """Check for one error sentence with these words, exit code 1 and no new files."""
-    before, folders = files(folder), {p for p in folder.rglob("*") if p.is_dir()}
+    before = files(folder), {*folder.rglob("*")}
     told = run_refused(*args)
     for word in words:
         assert word in told
-    assert files(folder) == before
-    assert {p for p in folder.rglob("*") if p.is_dir()} == folders
+    assert (files(folder), {*folder.rglob("*")}) == before
 
 
 @pytest.fixture(autouse=True)
@@ -61,7 +60,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
     """Fit a reconstruction once without --out; return the directory and the printed output.
 
-    The pictures are placeholders; report/test_result_figures.py tests the real ones.
+    The pictures are placeholders; the tests of separate processes draw real ones.
     """
     folder = tmp_path_factory.mktemp("fitted")
     with pytest.MonkeyPatch.context() as patch:
@@ -531,7 +530,7 @@ def process(*args: object) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_process_keeps_stdout_and_stderr_apart(here: Path) -> None:
-    good = process("published")  # for a fit see report/test_result_figures.py
+    good = process("published")
     assert (good.returncode, good.stderr) == (0, "")
     assert good.stdout.startswith("Published")
     bad = process("fit", write(here, rows=["x"]), "--out", "no")
@@ -540,15 +539,32 @@ def test_the_process_keeps_stdout_and_stderr_apart(here: Path) -> None:
     assert not (here / "no").exists()
 
 
-@pytest.mark.parametrize("args", ["['--help']", "['published']"])
-def test_the_light_commands_import_nothing_heavy(args: str) -> None:
+def test_the_light_commands_import_nothing_heavy() -> None:
     heavy = "{'numba', 'pandas', 'matplotlib', 'scipy', 'lmfit', 'pint'}"
     script = (
-        "import sys\nfrom foamfit.cli import main\n"
-        f"try:\n    main({args})\nexcept SystemExit as leaving:\n    assert leaving.code == 0\n"
-        f"print(sorted({heavy} & set(sys.modules)))"
+        "import sys\nfrom foamfit.cli import main\nfor name in ('--help', 'published'):\n"
+        "    try:\n        main([name])\n"
+        "    except SystemExit as leaving:\n        assert leaving.code == 0\n"
+        f"    print(name, sorted({heavy} & set(sys.modules)))"
     )
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
-    assert done.stdout.splitlines()[-1] == "[]"
+    told = done.stdout.splitlines()
+    assert "--help []" in told
+    assert told[-1] == "published []"
+
+
+def test_the_command_imports_what_a_fit_uses_and_prints_nothing_else(here: Path) -> None:
+    code = "import atexit, sys\natexit.register(lambda: print('modules', *sys.modules))\n"
+    code += "from foamfit.cli import main\nmain(sys.argv[1:])"
+    call = ["fit", str(RECONSTRUCTION), "--out", str(here / "r"), "--starts", "2", "--json"]
+    call = [sys.executable, "-c", code, *call, "--max-time", "5"]
+    run = subprocess.run(call, capture_output=True, text=True)
+    assert (run.returncode, run.stderr) == (0, "")
+    printed, _, modules = run.stdout.rpartition("modules ")
+    assert json.loads(printed)["test"].endswith("(reconstruction)")
+    assert (here / "r" / "fit.png").stat().st_size > 10_000
+    assert (here / "r" / "fit.pdf").read_bytes().startswith(b"%PDF")
+    assert "lmfit" in modules.split()
+    assert "unittest.mock" not in modules.split()

@@ -1,4 +1,4 @@
-"""Terminal output: all encodings, no control characters, correct exit codes."""
+"""Terminal output: all encodings, no control characters, exit codes, and --open."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import webbrowser
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 import fabricated
-from conftest import RECONSTRUCTION, small_pictures, without_pictures
+from conftest import RECONSTRUCTION, run_refused, small_pictures, without_pictures
 from foamfit import api, terminal
 from foamfit.cli import main
 from foamfit.errors import InputError
@@ -197,3 +198,49 @@ def test_a_command_leaves_the_signals_as_they_were(
     quick(monkeypatch)
     assert run("fit", RECONSTRUCTION, "--out", "r", "--quiet").exit_code == 0
     assert [signal.getsignal(number) for number in numbers] == before
+
+
+# ---------------------------------------------------------------- the report in the browser
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Simulate a browser and return the list of opened addresses."""
+    found: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", lambda address: bool(found.append(address)) or True)
+    return found
+
+
+@pytest.mark.parametrize(("status", "code"), [("ok", 0), ("warnings", 0), ("failed", 2)])
+def test_the_report_is_opened_whatever_was_found(
+    opened: list[str], monkeypatch: pytest.MonkeyPatch, status: str, code: int
+) -> None:
+    quick(monkeypatch, status=status)
+    assert run("fit", RECONSTRUCTION, "--out", "r", "--open").exit_code == code
+    assert opened == [(Path.cwd() / "r" / "report.html").as_uri()]
+
+
+@pytest.mark.parametrize("failure", [False, webbrowser.Error("could not locate runnable browser")])
+def test_without_a_browser_a_sentence_says_so_and_the_exit_code_stays(
+    opened: list[str], monkeypatch: pytest.MonkeyPatch, failure: bool | Exception
+) -> None:
+    def refuse(_: str) -> bool:
+        if isinstance(failure, Exception):
+            raise failure
+        return False
+
+    monkeypatch.setattr(webbrowser, "open", refuse)
+    quick(monkeypatch)
+    told = run("fit", RECONSTRUCTION, "--out", "r", "--open", "--quiet")
+    assert (told.exit_code, told.stdout) == (0, "")
+    path = Path("r") / "report.html"
+    assert told.stderr == f"foamfit: no browser could be opened; open {path} by hand\n"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["fit", "a.csv"], ["batch", "a.csv"], ["joint", "a.toml"], ["predict", "r", "a.csv"]],
+)
+def test_json_for_a_program_and_a_browser_exclude_each_other(command: list[str]) -> None:
+    told = run_refused(*command, "--open", "--json")
+    assert told == "foamfit: --open and --json exclude each other; leave one of them out\n"

@@ -1,15 +1,18 @@
-"""Smooth motions estimated from noisy displacements, compared with known motions."""
+"""Smooth motions and strain rates from noisy displacements, compared with known motions."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from conftest import HEIGHT, synthetic_loop
+from foamfit.data.cycles import loading_rate
 from foamfit.data.measurement import NoiseLevel
 from foamfit.data.motion import SmoothMotion, follow
-from foamfit.data.noise import estimated_noise
+from foamfit.data.noise import estimated_noise, with_noise
 
 DRAWS = 20
 SHAPES = {  # corners of straight lines (time, displacement), both normalised to one
@@ -120,3 +123,43 @@ def test_an_unknown_noise_is_found():
         t, _, noisy = measured(shape, 1000, 0.002, 1)
         for level in (estimated_noise(noisy), NoiseLevel(0.006, False, ""), given(0.0005)):
             assert follow(t, noisy, level).sigma == pytest.approx(0.002, rel=0.12)
+
+
+# ---------------------------------------------------------------- the mean strain rate on loading
+
+_, LOOP = synthetic_loop(noise=0.0)
+
+
+def moved(time, strain):
+    test = replace(LOOP, time=time, displacement=HEIGHT * strain, stress=np.sin(time / time[-1]))
+    return with_noise(test)
+
+
+def test_a_triangle_has_the_rate_of_its_loading():
+    time = np.linspace(0.0, 8.0, 801)  # 2 s of loading, 6 s of unloading
+    strain = np.interp(time, [0.0, 2.0, 8.0], [0.0, 0.5, 0.0])
+    assert loading_rate(moved(time, strain)) == pytest.approx(0.25, rel=1e-3)
+
+
+def test_noise_about_a_flat_peak_does_not_move_it():
+    """The largest sample can be a tenth of the duration away from the true peak."""
+    time, rng = np.linspace(0.0, 1e-3, 301), np.random.default_rng(0)
+    strain = 0.4 * np.sin(np.pi * time / time[-1])
+    rates = [loading_rate(moved(time, strain + 2e-3 * rng.standard_normal(301))) for _ in range(50)]
+    assert np.mean(rates) == pytest.approx(800.0, rel=0.02)
+    assert np.std(rates) < 8.0
+
+
+def test_a_hold_at_the_largest_strain_is_no_loading():
+    time = np.linspace(0.0, 30.0, 3001)
+    strain = np.interp(time, [0.0, 2.0, 20.0, 30.0], [0.0, 0.5, 0.5, 0.0])
+    noisy = strain + 1e-4 * np.random.default_rng(0).standard_normal(time.size)
+    assert loading_rate(moved(time, noisy)) == pytest.approx(0.25, rel=0.02)
+
+
+def test_the_rate_of_several_cycles_is_that_of_the_first():
+    """The largest sample may be in any cycle."""
+    time = np.linspace(0.0, 4.2, 1201)
+    strain = np.interp(time, [0.0, 2.0, 2.4, 3.8, 4.2], [0.0, 0.5, 0.0, 0.502, 0.0])
+    noisy = strain + 1e-4 * np.random.default_rng(0).standard_normal(time.size)
+    assert loading_rate(moved(time, noisy)) == pytest.approx(0.25, rel=0.02)

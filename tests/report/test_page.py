@@ -1,13 +1,19 @@
+"""The report as a page: what it shows and hides, and what the terminal shows of a result."""
+
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import fabricated
+from conftest import run, without_pictures, write_csv
 from foamfit.report.readable import readable
 from foamfit.report.result_figures import figures_of
 from foamfit.report.summary import render_report, summary_text
@@ -150,3 +156,51 @@ def test_many_parameters_and_warnings_are_still_one_screen(long: str) -> None:
     assert {name for name in one if f"\n{name} " in text} == {*one} - {"s2_eta", "s2_kh_minus"}
     assert "\nwarning: 0 word word" in text
     assert re.search(r"\nand \d more warnings: see the report, or --verbose\n", text)
+
+
+def test_the_report_has_the_budget_as_table_and_picture() -> None:
+    budget = fabricated.budget(area=0.02, contact_and_zero=0.01)
+    one = fabricated.result()
+    estimates = {
+        name: replace(p, systematic=0.02 * abs(p.value)) for name, p in one.parameters.items()
+    }
+    result = replace(one, budget=budget, parameters=estimates)
+    text = render_report(result, fabricated.no_figures())
+    page = text[text.index("Uncertainty budget") :]
+    head, row = (part.split("</tr>")[0] for part in page.split("<tr>")[1:3])
+    assert head.count("<th") == 6  # corner, three sources, combined, bars
+    assert "mass" not in head
+    for share in ("1 %", "2 %", "2.4 %"):  # √(1 + 1 + 4)
+        assert f">{share}<" in row
+    widths = [float(bar.split("%")[0]) for bar in row.split("width: ")[1:]]
+    assert widths == pytest.approx([100 / 6, 100 / 6, 400 / 6], abs=0.1)  # shares of variance
+    assert "± 0.11" in text  # 2 % of k0 = 5.5 MPa
+    assert "Systematic is one standard deviation" in text
+
+
+def test_what_check_finds_wrong_stands_before_all_other_warnings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Force in meganewtons, strain for another height, a loop of simple power laws."""
+    without_pictures(monkeypatch)
+    t = np.linspace(0.0, 2.4, 241)
+    w = np.minimum(t, 2.4 - t)
+    head = "time (s),force (MN),strain (%),displacement (mm)"
+    toml = (
+        '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n'
+        '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n[noise]\nstress = "1 Pa"\n'
+    )
+    force = 1e2 * w ** np.where(t < 1.2, 1, 2)
+    path = write_csv(tmp_path / "test.csv", head, t, force, 12 * w, w, fmt="%.6f", toml=toml)
+    call = ["fit", path, "--model", "linear", "--drive", "displacement", "--starts", "2"]
+    out = run(*call, "--out", tmp_path / "out")
+    assert out.exit_code in (0, 2), out.output
+    fit = json.loads((tmp_path / "out" / "fit.json").read_text())
+    asked = [text.startswith("Check:") for text in fit["warnings"]]
+    assert fit["status"] != "ok"
+    assert sum(asked) > 3
+    assert asked == sorted(asked, reverse=True)
+    assert not all(asked)
+    shown = " ".join(out.stdout.split())
+    for warning, on_input in zip(fit["warnings"], asked, strict=True):
+        assert not on_input or f"warning: {warning}"[:60] in shown

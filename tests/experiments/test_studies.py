@@ -1,14 +1,70 @@
-"""The main numbers of the study of the paper's claims, several against closed forms."""
+"""Studies whose models know nothing of foamfit: rigs, micro-springs and the claims of the paper."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 import claims
 import foamfit as ff
+import microscale
+import rig
+import rigs
 from claims import FOAM_2, MODEL_1, MODEL_2, MODEL_3, OWN_MASS, STRIKER
+
+
+def share(found: np.ndarray, truth: np.ndarray) -> float:
+    return float(np.abs(found - truth).max() / np.ptp(truth))
+
+
+@pytest.mark.parametrize("law", ["bistable", "microscale"])
+@pytest.mark.parametrize("relaxation", [0, 1])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_impacts_are_those_of_foamfit(law: str, relaxation: int, seed: int) -> None:
+    course = rig.impact(rig.Impact(law=law, relaxation=relaxation), seed).course
+    time, drive = np.linspace(0.0, 1.02 * course.end, 800), course.rig
+    found = ff.simulate(
+        rigs.chain_of(drive), ff.Impact(drive.mass, drive.velocity), time, rtol=1e-9
+    )
+    assert share(found.base_stress, course.stress(time)) < 1e-6
+    assert share(found.displacement[-1], course.top(time, gauge=False)) < 1e-6
+    assert found.contact_end == pytest.approx(course.end, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "setup",
+    [
+        rig.Slow(law="bistable", inner=0.05, motion="trapezoid"),
+        rig.Slow(law="bistable+bistable", inner=0.1),
+        rig.Slow(inner=0.1),
+        rig.Slow(relaxation=2, motion="ramp", early=True),
+        rig.Slow(relaxation=1, motion="sine"),
+        rig.Slow(dashpot=True, relaxation=1),
+    ],
+)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_slow_tests_are_those_of_foamfit(setup: rig.Slow, seed: int) -> None:
+    course = rig.slow(setup, seed).course
+    assert course.rig.motion is not None
+    turns = [t for t in course.rig.motion.times if course.start < t < course.end]
+    # foamfit interpolates the motion linearly, so a sine and a ramp need many samples.
+    samples = 20_001 if setup.motion in ("sine", "ramp") else 1_001
+    time = np.union1d(np.linspace(course.start, course.end, samples), turns)
+    drive = ff.DisplacementDrive(course.top(time, gauge=False))
+    found = ff.simulate(rigs.chain_of(course.rig), drive, time - course.start, rtol=1e-9)
+    smooth = ~np.isin(time, [*turns, course.start])  # a dashpot's stress jumps at a turn
+    assert share(found.base_stress[smooth], course.stress(time)[smooth]) < 1e-6
+
+
+def test_micro_springs_converge_to_the_law_as_their_number() -> None:
+    table = [(n, *microscale.errors(n)) for n in (10, 100)]
+    assert microscale.rate(table, 1) == pytest.approx(-1.0, abs=0.02)
+    assert table[0][1] == pytest.approx(0.0131, rel=0.01)
+
+
+# -------------------------------------------------------------- the claims of the paper, in numbers
 
 
 @pytest.fixture(scope="module")
