@@ -34,7 +34,7 @@ def serving(files):
         address=address, port=int(port), token=token, files=files, process=process
     )
     process.send_signal(signal.SIGTERM)
-    _, errors = process.communicate(timeout=20)
+    _, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
     assert "Traceback" not in errors, errors
     assert list(files.iterdir()) == []  # no files are left behind

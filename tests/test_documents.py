@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import pytest
 
 import foamfit as ff
-from conftest import RECONSTRUCTION, ROOT
+from conftest import RECONSTRUCTION, ROOT, small_pictures
 from foamfit.cli import main
 from foamfit.springs import laws
 
@@ -31,7 +31,7 @@ def fitted():
 
 @pytest.fixture
 def place(tmp_path, monkeypatch, fitted):
-    """A folder like that of a user, in which the same test is fitted only once."""
+    """A folder like that of a user, in which fits and pictures take little time."""
     (tmp_path / "experiments").symlink_to(ROOT / "experiments")
     shutil.copy(RECONSTRUCTION, tmp_path / "TEST.csv")
     shutil.copy(RECONSTRUCTION.with_suffix(".toml"), tmp_path / "TEST.toml")
@@ -39,10 +39,12 @@ def place(tmp_path, monkeypatch, fitted):
     fitted.save(tmp_path / "fits/TEST/bistable", report=False)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
+    small_pictures(monkeypatch)
     own = ff.fit
 
     def fit(test, model="bistable", **more):
-        return own(test, model=model, **more) if more or model != "bistable" else fitted
+        quick = {"starts": 1, "intervals": "local"}
+        return own(test, model=model, **quick | more) if more or model != "bistable" else fitted
 
     monkeypatch.setattr(ff, "fit", fit)
     monkeypatch.setattr(laws, "_LAWS", dict(laws._LAWS))

@@ -15,7 +15,7 @@ import pytest
 
 from conftest import EXPERIMENTS
 from cycled import write_record
-from serving import served, serving
+from serving import served
 
 api = pytest.importorskip(
     "playwright.sync_api", reason='no browser is driven without: pip install "foamfit[test]"'
@@ -340,15 +340,6 @@ def test_sliders_about_to_be_replaced_cannot_be_moved(window):
     assert window.evaluate("window.seen")
 
 
-def test_the_page_says_that_its_program_has_ended(chromium, tmp_path):
-    with serving(tmp_path) as served, opened(chromium, served) as page:
-        api.expect(page.get_by_text("has ended")).to_be_hidden()
-        page.wait_for_function("Bokeh.documents[0].is_idle")
-        served.process.terminate()
-        served.process.wait(timeout=20)
-        api.expect(page.get_by_text("has ended")).to_be_visible()
-
-
 def test_a_raw_file_is_drawn_prompts_for_its_specimen_and_offers_its_columns(
     chromium, served, tmp_path
 ):
@@ -374,3 +365,13 @@ def test_a_raw_file_is_drawn_prompts_for_its_specimen_and_offers_its_columns(
         for width in (390, 1280):
             page.set_viewport_size({"width": width, "height": 800})
             page.wait_for_function(f"document.documentElement.scrollWidth <= {width}")
+
+
+def test_the_page_says_that_its_program_has_ended(chromium, served):
+    """The last test of this file, as it ends the program."""
+    with opened(chromium, served) as page:
+        api.expect(page.get_by_text("has ended")).to_be_hidden()
+        page.wait_for_function("Bokeh.documents[0].is_idle")
+        served.process.terminate()
+        served.process.wait(timeout=120)
+        api.expect(page.get_by_text("has ended")).to_be_visible()

@@ -17,6 +17,7 @@ import pytest
 import foamfit as ff
 from conftest import EXPERIMENTS, few_bytes, run, without_pictures, write_lines
 from cycled import write_record
+from foamfit.data import rig as rig_module
 from foamfit.errors import InputError
 from foamfit.page import desk as desk_module
 from foamfit.page import worker as worker_module
@@ -34,6 +35,7 @@ from foamfit.page.turning import Turning
 from foamfit.page.worker import News, Worker
 from foamfit.report.folder import load_result
 from foamfit.study import cycles as cycles_report
+from foamfit.study import plan as plan_module
 
 TEST = EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv"
 GOOD = {
@@ -392,6 +394,8 @@ def test_an_entry_is_replaced_and_removed_and_the_rest_stays():
 def test_a_fit_offers_its_card_and_the_plan_of_the_next_test(desk, tmp_path, monkeypatch):
     ff.fit(ff.read_test(TEST), starts=2, intervals="local").save(tmp_path / "fit", report=False)
     monkeypatch.setattr(Desk, "fits", {0: tmp_path / "fit"})
+    monkeypatch.setattr(plan_module, "DRAWS", 10)  # most of the time
+    monkeypatch.setattr(rig_module, "VELOCITIES", 8)
     names = zipfile.ZipFile(io.BytesIO(desk.card(0))).namelist()
     assert {"foam.k", "foam.k.json"} <= set(names)
     assert b"which test next?" in desk.planned(0)

@@ -15,7 +15,7 @@ __all__ = ["served"]
 
 def ask(served, path, method="GET", body=None, **headers):
     """Send a request without any changes; return status and response."""
-    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=60)
     names = {"Host": f"127.0.0.1:{served.port}"}
     names |= {name.replace("_", "-"): value for name, value in headers.items()}
     connection.putrequest(method, path, skip_host=True)
