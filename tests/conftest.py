@@ -116,9 +116,9 @@ def compiled() -> Iterator[None]:
     yield
 
 
-def run(*args: object) -> Result:
-    """Call a command of foamfit."""
-    return CliRunner().invoke(main, [str(arg) for arg in args])
+def run(*args: object, encoding: str = "utf-8") -> Result:
+    """Call a command of foamfit in a terminal of this encoding."""
+    return CliRunner(charset=encoding).invoke(main, [str(arg) for arg in args])
 
 
 def run_refused(*args: object) -> str:

@@ -31,7 +31,5 @@ def write_record(folder: Path) -> Path:
     stress = stress + 500.0 * np.random.default_rng(0).standard_normal(stress.size)
     columns = 0.01 * np.arange(strain.size), 1e-6 * stress, 1e3 * HEIGHT * strain
     path, head = folder / "synthetic.csv", "time (s),stress (MPa),displacement (mm)"
-    write_csv(path, head, *columns, fmt="%.6f")
     toml = f'[specimen]\nheight = "{1e3 * HEIGHT} mm"\narea = "{1e6 * AREA} mm^2"\n'
-    path.with_suffix(".toml").write_text(toml)
-    return path
+    return write_csv(path, head, *columns, fmt="%.6f", toml=toml)

@@ -93,15 +93,11 @@ def result(**changed: Any) -> FitResult:
     measured_displacement = 1.01 * strain * HEIGHT
     given: dict[str, Any] = {
         "measurement": Measurement(
-            name="VACNT foam-1, reconstruction",
-            path=None,
-            data_sha256="5d41402abc4b2a76b9719d911017c592ae1f0f0e4d1e7e5f8a3b2c1d0e9f8a7b",
-            time=time,
-            stress=measured_stress,
-            displacement=measured_displacement,
-            specimen=Specimen(height=HEIGHT, area=AREA, mass=5.56e-6),
-            striker=Striker(mass=7e-3, velocity=1.75),
-            motion="measured",
+            "VACNT foam-1, reconstruction", None,
+            "5d41402abc4b2a76b9719d911017c592ae1f0f0e4d1e7e5f8a3b2c1d0e9f8a7b",
+            time, measured_stress, measured_displacement,
+            Specimen(height=HEIGHT, area=AREA, mass=5.56e-6),
+            Striker(mass=7e-3, velocity=1.75), motion="measured",
             notes=("The force was divided by the area 19.6 mm².", "Time zero was set at contact."),
         ),
         "model": "bistable",
@@ -125,12 +121,7 @@ def result(**changed: Any) -> FitResult:
         },
         "runtime_s": 21.4,
         "curves": Curves(
-            time=time,
-            measured_stress=measured_stress,
-            measured_displacement=measured_displacement,
-            stress=stress,
-            displacement=strain * HEIGHT,
-            stress_along=stress * 1.01,
+            time, measured_stress, measured_displacement, stress, strain * HEIGHT, stress * 1.01
         ),
         "switches": switches,
     }  # fmt: skip

@@ -269,25 +269,6 @@ def test_simulate_a_drive_from_a_file(
 # Invalid input is rejected with one sentence.
 
 
-@pytest.mark.parametrize("command", ["check", "fit"])
-@pytest.mark.parametrize(
-    ("content", "toml", "words"),
-    [
-        (b"", SPECIMEN, ("test.csv", "empty")),
-        (None, "[specimen]\n", ("height is missing", "diameter", "area", '"1.19 mm"', '"5 mm"')),
-        (None, SPECIMEN.replace('"10', '"-10'), ("test.toml", "height", "must be positive")),
-    ],
-)
-def test_refuses_files(
-    here: Path, command: str, content: bytes | None, toml: str, words: tuple[str, ...]
-) -> None:
-    """Two examples of what tests/data/test_csv_file.py tries."""
-    path = write(here, toml=toml)
-    if content is not None:
-        path.write_bytes(content)
-    refused(here, command, path, words=words)
-
-
 @pytest.mark.parametrize(
     ("more", "args", "words"),
     [

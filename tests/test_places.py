@@ -12,7 +12,7 @@ from click.testing import Result
 
 import fabricated
 import foamfit as ff
-from conftest import run, run_refused, without_pictures
+from conftest import run, run_refused, without_pictures, write_csv
 
 TOML = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\nmass = "1 g"\n'
 FAST = ("--model", "linear", "--quiet", "--no-report")
@@ -22,11 +22,9 @@ def write(path: Path, seed: int = 0) -> Path:
     """Write a slow record of three cycles of a linear foam, as a rig would."""
     strain = np.tile(np.concatenate([np.linspace(0, 0.4, 40), np.linspace(0.4, 0, 40)[1:-1]]), 3)
     stress = 2.0 * strain + 2e-3 * np.random.default_rng(seed).standard_normal(strain.size)
-    table = np.column_stack([0.1 * np.arange(strain.size), stress, 10.0 * strain])
-    rows = [f"{t:.1f},{s:.6f},{e:.6f}" for t, s, e in table]
-    path.write_text("\n".join(["time (s),stress (MPa),displacement (mm)", *rows]) + "\n")
-    path.with_suffix(".toml").write_text(TOML)
-    return path
+    columns = 0.1 * np.arange(strain.size), stress, 10.0 * strain
+    head = "time (s),stress (MPa),displacement (mm)"
+    return write_csv(path, head, *columns, fmt="%.6f", toml=TOML)
 
 
 @pytest.fixture(autouse=True)

@@ -15,12 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 import fabricated
-from conftest import RECONSTRUCTION, run_refused, small_pictures, without_pictures
+from conftest import RECONSTRUCTION, run, run_refused, small_pictures, without_pictures
 from foamfit import api, terminal
-from foamfit.cli import main
 from foamfit.errors import InputError
 from foamfit.terminal import ending_cleanly, printable
 
@@ -33,10 +31,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     small_pictures(monkeypatch)
     return tmp_path
-
-
-def run(*args: object, encoding: str = "utf-8") -> Result:
-    return CliRunner(charset=encoding).invoke(main, [str(arg) for arg in args])
 
 
 def quick(monkeypatch: pytest.MonkeyPatch, *, light: bool = True, **changed: object) -> None:

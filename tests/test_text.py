@@ -16,7 +16,7 @@ from foamfit.text import (
     signed,
     significant,
     wrapped,
-)
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -26,18 +26,10 @@ def bounce():
     w = np.concatenate([top * np.sin(omega * loading), top * np.cos(slow * unloading)])
     stiffness = np.where(time <= loading[-1], STIFFNESS, STIFFNESS * (REBOUND / VELOCITY) ** 2)
     return Measurement(
-        name="bounce",
-        path=None,
-        data_sha256="",
-        time=time,
-        stress=stiffness * w / SPECIMEN.area,
-        displacement=w,
-        specimen=SPECIMEN,
-        striker=Striker(MASS, VELOCITY),
-        noise=Noise(stress=2e4),
-        motion="measured",
+        "bounce", None, "", time, stiffness * w / SPECIMEN.area, w, SPECIMEN,
+        Striker(MASS, VELOCITY), Noise(stress=2e4), motion="measured",
         notes=("Read it.", "Contact starts at the first sample."),
-    )
+    )  # fmt: skip
 
 
 def test_a_test_that_closes():

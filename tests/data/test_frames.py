@@ -16,6 +16,7 @@ from foamfit.study.study_file import find_tests
 
 LAST = 4e-3  # s
 MOTION = '[motion]\nfile = "camera.csv"\n'
+COLUMNS = MOTION + "[motion.columns]\n"
 
 
 def clock(rate):
@@ -106,8 +107,7 @@ def test_a_faster_motion_is_interpolated_or_averaged_and_counts_everywhere(rate,
 
 def test_masses_inside_and_columns_of_the_toml(tmp_path):
     at = clock(1e4)
-    toml = MOTION + (
-        "[motion.columns]\n"
+    toml = COLUMNS + (
         'time = { column = "A", unit = "ms" }\n'
         'displacement = { column = "B", unit = "px", scale = "-10 um/px ± 2 %" }\n'
         'displacement_1 = { column = "C", unit = "mm" }\n'
@@ -200,12 +200,9 @@ def test_a_motion_is_no_test_of_its_own(tmp_path):
                 "0 s to 4 ms",
             ],
         ),
+        (COLUMNS + 'force = { column = "F" }\n', ["[motion.columns] has no key 'force'"]),
         (
-            MOTION + '[motion.columns]\nforce = { column = "F" }\n',
-            ["[motion.columns] has no key 'force'"],
-        ),
-        (
-            MOTION + '[motion.columns]\ndisplacement = { column = "x" }\n',
+            COLUMNS + 'displacement = { column = "x" }\n',
             ["camera.csv: [motion.columns] displacement: column 'x' is nowhere"],
         ),
     ],

@@ -75,9 +75,6 @@ def stuck(w, first, last):
     return np.concatenate((w[:first], np.full(last - first, w[first]), w[last:]))
 
 
-# ------------------------------------------------------------------------------- detections
-
-
 @pytest.mark.parametrize("timed", [True, False], ids=["time", "no time"])
 @pytest.mark.parametrize(
     ("ramps", "first", "last", "every"),
@@ -131,9 +128,6 @@ def test_only_the_stretches_of_the_cycle_that_is_used_are_named(tmp_path):
     assert f"rows {second + 603} to {second + 641} " in note
 
 
-# -------------------------------------------------------------------------- no false detections
-
-
 @pytest.mark.parametrize("noise", [0.0, 0.003])
 @pytest.mark.parametrize("digit", [0.0, 0.3])  # mm
 @pytest.mark.parametrize("every", [1, 5])
@@ -158,18 +152,12 @@ def test_a_true_hold_is_no_standstill(ramps, every, digit, noise):
     assert not notes(conditioned(shown, stress, noise))
 
 
-# --------------------------------------------------------------------------------------- in figures
-
-
 @pytest.mark.parametrize("noise", [0.0, 0.003])
 def test_a_gauge_that_slips_after_a_hold_at_constant_stress_has_not_stood_still(noise):
     """A sticking gauge hides a motion that changes the stress; here the motion did rest."""
     true = motion((4.0, 300), (4.0, 60), (TOP, 150), (0.0, 450))
     shown = true + np.where(np.arange(true.size) > 360, 0.3, 0.0)
     assert notes(conditioned(shown, 20.0 * true, noise)) == []
-
-
-# ------------------------------------------------------------------------------------ real records
 
 
 @needs_data

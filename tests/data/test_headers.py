@@ -37,18 +37,15 @@ FIRST, NAMES = "Compression of a foam, sample 3", "Time,Force,Displacement"
 def test_a_header_may_have_several_rows(
     tmp_path: Path, head: list[str], end: str, encoding: str
 ) -> None:
-    lines = [line.replace("\n", end) for line in head]
-    test = read_test(write_lines(tmp_path, [*lines, *ROWS], newline=end, encoding=encoding))
+    form = {"newline": end, "encoding": encoding}
+    test = read_test(write_lines(tmp_path, [*head, *ROWS], **form))
     assert (test.rows.rows, test.rows.used) == (T.size, T.size)
     assert test.stress.max() == pytest.approx(2e6)
     assert test.displacement.max() == pytest.approx(4e-3)
     assert test.time[-1] == pytest.approx(10.0)
     broken = [*ROWS[:7], "0.35,x,1", *ROWS[8:]]
     count = sum(line.count("\n") + 1 for line in head)
-    refused(
-        write_lines(tmp_path, [*lines, *broken], newline=end, encoding=encoding),
-        f"row {count + 8}, column",
-    )
+    refused(write_lines(tmp_path, [*head, *broken], **form), f"row {count + 8}, column")
 
 
 @pytest.mark.parametrize(

@@ -233,9 +233,6 @@ def test_a_force_that_is_never_positive_is_refused(tmp_path: Path) -> None:
     refused(path, "the stress is never positive in the part that is used, only -300 kPa to 0 Pa")
 
 
-# ---------------------------------------------------------------------- what is said
-
-
 def test_every_output_says_what_was_reversed(tmp_path: Path) -> None:
     w = path_through([0, 5, 0])
     path = written(
@@ -253,9 +250,6 @@ def test_every_output_says_what_was_reversed(tmp_path: Path) -> None:
         assert note in in_json
     line = "sign reversed (negative in compression): force, displacement\n"
     assert line in summary_text(result)
-
-
-# ---------------------------------------------------------------------- measured records
 
 
 @needs_data

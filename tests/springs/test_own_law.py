@@ -431,33 +431,29 @@ def _third(p, x, strain, branch, up):  # type: ignore[no-untyped-def]
 def test_a_wrong_law_gets_one_sentence(bouc_wen: Law) -> None:
     of = bouc_wen.functions
     assert isinstance(of, ff.Functions)
-    first = bouc_wen.params[0]
+
+    def functions(**by: object) -> Law:
+        return changed(bouc_wen, functions=of._replace(**by))
+
+    def parameter(**by: object) -> Law:
+        return changed(bouc_wen, params=(dataclasses.replace(bouc_wen.params[0], **by),))
+
     wrong = {
-        "the function stress is missing": changed(bouc_wen, functions=of._replace(stress=None)),
-        "the function along is missing": changed(
-            bouc_wen, functions=of._replace(along=None, switch=None, ends=None)
-        ),
+        "the function stress is missing": functions(stress=None),
+        "the function along is missing": functions(along=None, switch=None, ends=None),
         "along fills the rates of internal variables": changed(bouc_wen, internal=0),
-        "the function switch is missing": changed(bouc_wen, functions=of._replace(switch=None)),
+        "the function switch is missing": functions(switch=None),
         "internal must be a number": changed(bouc_wen, internal=33),
-        "the function stress goes beyond": changed(
-            bouc_wen, internal=0, functions=of._replace(along=None)
-        ),
-        "a branch has the number 2": changed(bouc_wen, functions=of._replace(switch=_third)),
-        "the stress falls on loading": changed(bouc_wen, functions=of._replace(stress=_falling)),
-        "the stress is not finite": changed(bouc_wen, functions=of._replace(stress=_infinite)),
-        "its functions cannot be compiled": changed(
-            bouc_wen, functions=of._replace(viscous=_nothing)
-        ),
+        "the function stress goes beyond": changed(functions(along=None), internal=0),
+        "a branch has the number 2": functions(switch=_third),
+        "the stress falls on loading": functions(stress=_falling),
+        "the stress is not finite": functions(stress=_infinite),
+        "its functions cannot be compiled": functions(viscous=_nothing),
         "the name is that of a law of foamfit": changed(bouc_wen, kind="bistable"),
         "its kind must be small letters": changed(bouc_wen, kind="Bouc Wen"),
         "it has no parameters": changed(bouc_wen, params=()),
-        "parameter 'eta': the name is taken": changed(
-            bouc_wen, params=(dataclasses.replace(first, name="eta"),)
-        ),
-        "parameter 'k': its coordinate is a logarithm": changed(
-            bouc_wen, params=(dataclasses.replace(first, bounds=(0.0, 1.0)),)
-        ),
+        "parameter 'eta': the name is taken": parameter(name="eta"),
+        "parameter 'k': its coordinate is a logarithm": parameter(bounds=(0.0, 1.0)),
     }
     for message, law in wrong.items():
         with pytest.raises(ff.InputError, match=f"^law '{law.kind}': .*{message}") as caught:

@@ -73,9 +73,6 @@ def test_ctrl_c_keeps_what_was_found(record, monkeypatch, at):
     assert len(kept.results) + len(kept.refused) == 3
 
 
-# -------------------------------------------------------------------------------- the folder
-
-
 def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
     monkeypatch.setattr(cycles_report, "plot_cycles", lambda *_, **__: None)
@@ -103,9 +100,6 @@ def test_the_folder_holds_every_cycle_and_replaces_an_older_one(found, tmp_path,
     assert "cycles.csv" not in {path.name for path in folder.iterdir()}
 
 
-# -------------------------------------------------------------------------------- the command
-
-
 @pytest.mark.parametrize("cycle", ["0", "x", "1,,2", "-1", "1.5", ""])
 def test_what_is_no_cycle_is_refused(record, tmp_path, cycle):
     told = run_refused("fit", record, "--cycle", cycle, "--out", tmp_path / "out")
@@ -130,9 +124,6 @@ def test_cycles_of_different_models_are_one_table():
     *_, first, second = ff.CycleFits("foam", "auto", (1, 2), fits, {}).text().splitlines()
     assert first.split()[-2:] == ["–", "–"]
     assert "–" not in second
-
-
-# -------------------------------------------------------------------------------- measured foam
 
 
 @needs_data

@@ -155,9 +155,6 @@ def test_the_band_holds_what_a_noisy_motion_leaves_uncertain(tmp_path):
         assert "stress half width, motion (Pa)" in one.columns
 
 
-# ------------------------------------------------------------------------------- batch, page, auto
-
-
 def test_what_nothing_shows_cannot_vary(together):
     test = ff.read_test(together[0] / "t1.csv")
     params = ff.make_params(test)
