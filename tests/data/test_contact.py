@@ -83,7 +83,7 @@ ZEROS = [(0.0, 0.0, 0.0), (-0.9, 0.7, 0.4), (0.8, -1.0, -0.6)]
 @pytest.mark.parametrize("channels", CHANNELS)
 @pytest.mark.parametrize("gauge", ["flight", "rest"])
 @pytest.mark.parametrize("tau", [1, 8])
-@pytest.mark.parametrize(("n", "before"), [(80, 40), (500, 150), (500, 2000), (8000, 3000)])
+@pytest.mark.parametrize(("n", "before"), [(80, 40), (500, 150), (500, 2000), (4000, 1500)])
 def test_the_start_is_found_within_samples_or_a_few_percent(channels, gauge, tau, n, before):
     # One zero for each noise level, which differ between channels: so every pair is covered.
     shift = CHANNELS.index(channels)

@@ -253,12 +253,8 @@ def test_memory_errors_and_other_versions_are_not_the_fault_of_a_test(here, monk
     monkeypatch.setattr(batch_work, "fit", lambda *_, **__: (_ for _ in ()).throw(MemoryError()))
     frame = again().set_index("test")
     assert "its fit was lost (MemoryError" in frame.loc["a", "error"]
-    assert names("out") == [
-        "bad",
-        "summary.csv",
-        "summary.html",
-        "summary.tex",
-    ]  # no result of the test, so the next call retries it
+    # There is no result of the test, so the next call retries it.
+    assert names("out") == ["bad", "summary.csv", "summary.html", "summary.tex"]
 
 
 def test_an_executor_that_ends_is_one_sentence_and_what_is_done_stays(here, tried):
