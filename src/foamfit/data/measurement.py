@@ -381,8 +381,8 @@ class Measurement(Samples):
 
 
 def is_velocity(test: Record | Measurement) -> bool:
-    """Return whether a velocity alone was recorded, which was integrated and differentiated."""
-    return test.motion == FROM_VELOCITY and "stress" in test.derived
+    """Return whether the motion is the integral of a recorded velocity."""
+    return test.motion == FROM_VELOCITY
 
 
 def is_clipped(test: Measurement) -> bool:

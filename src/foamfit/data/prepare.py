@@ -120,7 +120,7 @@ def condition(
     block = -(-len(whole) // len(record))
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
-    if is_velocity(whole):
+    if is_velocity(whole) and (impact or "stress" in whole.derived):
         assert whole.time is not None
         assert whole.velocity is not None
         step = float(np.median(np.diff(whole.time)))

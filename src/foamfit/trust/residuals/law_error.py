@@ -9,6 +9,7 @@ beyond it; otherwise the residual is the noise.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import NamedTuple
@@ -157,7 +158,7 @@ def curve_errors(
     jacobian: Array,
     sizes: tuple[int, ...],
     taken: Array | None = None,
-    driven: bool = False,
+    slow: Collection[int] = (),
 ) -> tuple[CurveError, ...]:
     """Separate noise and model error in the residual of each curve.
 
@@ -167,17 +168,19 @@ def curve_errors(
     noise. The Bayesian information criterion decides between the two; among 1200 records of white
     and first-order noise (autocorrelations up to 0.95, 120 to 5000 samples) it found model error in
     one. A process that scatters about local cubics more than `ROUGHER` times as much as the
-    residual cannot be its noise; such a residual also contains model error. If the test is `driven`
-    by a stress, all is taken as noise: noise of the stress passes through the springs as slow waves
-    of the displacement, which look like model error. So does the noise of one curve that a fit
+    residual cannot be its noise; such a residual also contains model error. The residual of curves
+    with `slow` noise is all taken as noise: noise of a driving stress passes through the springs as
+    slow waves of the displacement, which look like model error, as does that of a velocity in its
+    integral. So does the noise of one curve that a fit
     leaves in another, more exact one, if it does not weigh both by their noise: what a fit by the
     noise would take away is no model error (one test alone).
     """
     own = noise_processes(residual, jacobian, sizes, taken)
-    if driven:
+    if len(slow) == len(sizes):
         return tuple(map(CurveError, own))
     basis = basis_of(jacobian) if taken is None else taken
     found = _separated(residual, basis, sizes, own)
+    found = tuple(CurveError(own[i]) if i in slow else one for i, one in enumerate(found))
     errs = [error.found for error in found]
     if taken is not None or all(errs) or not any(errs):
         return found
