@@ -71,6 +71,17 @@ def test_an_error_of_a_held_parameter_is_added():
     assert found.stderr[0] == pytest.approx(np.hypot(1.0 / np.sqrt(n), off), rel=1e-3)
 
 
+def test_the_curvature_is_that_at_the_bottom_of_a_curved_valley():
+    """One standard error away the fourth-order term is up to 400 times as large."""
+    hessian, steep = np.array([[1.5, 0.2], [0.2, 0.8]]), np.array([2.0, -4.0])
+    block = Block(
+        np.eye(9, 2), np.zeros(9), (9,), [NoiseProcess(np.zeros(0), 1.0)], np.eye(2),
+        lambda places, step: (hessian @ step + (steep @ step) ** 3 * steep)[places],
+    )  # fmt: skip
+    found = block.curvature(np.eye(2))
+    assert np.linalg.eigvalsh(found) == pytest.approx(np.linalg.eigvalsh(hessian), rel=0.02)
+
+
 def test_a_direction_without_trace_is_not_a_number():
     x = np.linspace(0, 1, 100)
     jacobian = np.column_stack([x, x, np.ones_like(x)])

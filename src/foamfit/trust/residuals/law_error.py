@@ -171,9 +171,9 @@ def curve_errors(
     residual cannot be its noise; such a residual also contains model error. The residual of curves
     with `slow` noise is all taken as noise: noise of a driving stress passes through the springs as
     slow waves of the displacement, which look like model error, as does that of a velocity in its
-    integral. So does the noise of one curve that a fit
-    leaves in another, more exact one, if it does not weigh both by their noise: what a fit by the
-    noise would take away is no model error (one test alone).
+    integral. So does the noise of one curve that a fit leaves in another, more exact one, if it
+    does not weigh both by their noise: what a fit by the noise would take away is no model error
+    (one test alone).
     """
     own = noise_processes(residual, jacobian, sizes, taken)
     if len(slow) == len(sizes):
