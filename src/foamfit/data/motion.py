@@ -178,12 +178,11 @@ class _Fit:
         fit = self.refined(_STIFF * penalty, 4)
         return fit.refined(fit.best[1], 6)
 
-    def covariance(self, penalty: float, share: float) -> tuple[Array, Array, float]:
+    def covariance(self, penalty: float) -> tuple[Array, Array]:
         """Return the uncertainty of the spline and of the jumps and instants of the kinks.
 
         It consists of changes by one standard deviation each (unknowns, m), largest first, which
-        contain a share of the variance at the samples; the standard errors of the instants; and the
-        effective number of parameters.
+        contain most of the variance at the samples, and the standard errors of the instants.
         """
         s, k, size = self.samples, self.instants.size, self.samples.rough.size
         jumps, late = self.solve(penalty)[1], s.x[:, None] - self.instants
@@ -198,9 +197,8 @@ class _Fit:
             stderr = np.maximum(np.linalg.norm(half[size + k :], axis=1), 1e-15)
             past = ndtr(late / stderr)
         parts, turned = np.linalg.eigh(half.T @ data @ half)
-        dof = float(parts.sum())
-        few = int(np.searchsorted(np.cumsum(parts[::-1]), share * dof)) + 1
-        return half @ turned[:, ::-1][:, :few], stderr, dof
+        few = int(np.searchsorted(np.cumsum(parts[::-1]), _SHARE * float(parts.sum()))) + 1
+        return half @ turned[:, ::-1][:, :few], stderr
 
 
 def _with_more(fit: _Fit) -> _Fit:
@@ -304,13 +302,10 @@ class SmoothMotion:
         Times at which the motion turns, s.
     sigma : float
         Standard deviation of the noise, m.
-    dof : float
-        Effective number of parameters of the motion.
     """
 
     turns: Array
     sigma: float
-    dof: float
     _curve: PPoly
     _modes: _Modes
     _start: float
@@ -383,7 +378,7 @@ def _motion(
     """Construct the monotone curve, its turns and its modes."""
     samples, instants = fit.samples, fit.instants
     spline, jumps = (unit * v for v in fit.solve(penalty))
-    half, stderr, dof = fit.covariance(penalty, _SHARE)
+    half, stderr = fit.covariance(penalty)
     k, size = instants.size, spline.size
     bend = BSpline(samples.knots, samples.rotation @ spline, _DEGREE)
 
@@ -406,7 +401,7 @@ def _motion(
     turns = _turns(x, values, modes, (1e-300, 2.0 * unit))
     curve, (start, duration) = _monotone(x, values, velocities, turns), span
     at = start + duration * x[turns[1:-1]]
-    return SmoothMotion(at, sigma, dof, curve, modes, start, duration)
+    return SmoothMotion(at, sigma, curve, modes, start, duration)
 
 
 def _exact(times: Array, values: Array, sigma: float) -> SmoothMotion:
@@ -423,7 +418,7 @@ def _exact(times: Array, values: Array, sigma: float) -> SmoothMotion:
         x, values = np.insert(x, places, more), np.insert(values, places, heights)
     turns, slopes = _turns(x, values, modes, bounds), np.gradient(values, x)
     curve, at = _monotone(x, values, (slopes, slopes), turns), start + duration * x[turns[1:-1]]
-    return SmoothMotion(at, sigma, float(x.size), curve, modes, start, duration)
+    return SmoothMotion(at, sigma, curve, modes, start, duration)
 
 
 def _corner(x: Array, y: Array, i: int, tolerance: float) -> tuple[float, float] | None:
