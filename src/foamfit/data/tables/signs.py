@@ -113,15 +113,12 @@ class _Run(NamedTuple):
         ends = slice(_FEW), slice(-1, -_FEW - 1, -1)
         near = (np.abs(motion[e] - motion[e][0]) <= _NEAR * np.ptp(motion) for e in ends)
         start, end = (float(np.median(force[e][n])) for e, n in zip(ends, near, strict=True))
-        way, work = int(np.sign(motion[-1] - motion[0])), _work(force - start, motion)
+        way = int(np.sign(motion[-1] - motion[0]))
+        work, other = (float(np.trapezoid(force - zero, motion)) for zero in (start, end))
         falls = abs(end) < _UNLOADED * abs(start) and abs(start) > 0.5 * float(np.abs(force).max())
         # A long way without load does no work from the level at that end.
-        least = min(abs(work), abs(_work(force - end, motion)))
+        least = min(abs(work), abs(other))
         return cls(*((end, -way) if falls else (start, way)), math.copysign(least, work))
-
-
-def _work(force: Array, motion: Array) -> float:
-    return float(0.5 * np.dot(force[1:] + force[:-1], np.diff(motion)))
 
 
 def _pulse_is_negative(force: Array) -> bool:
