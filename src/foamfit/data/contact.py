@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -257,16 +256,9 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
     return _at_first(time)
 
 
-class Rise(NamedTuple):
-    """Contact time by the first rise, s (or sample number), and its standard error."""
-
-    time: float
-    error: float
-
-
 def rise_of(
     time: Array, values: Array, noise: NoiseLevel, rest: int, zero: float | None
-) -> Rise | None:
+) -> Kink | None:
     """Estimate the contact time from the first rise of a channel; None with too few rows.
 
     For every trial time of contact, least squares fits a level before it and, from it on, a jump, a
@@ -318,7 +310,7 @@ def rise_of(
     mean = float(weights @ trials / weights.sum())
     grid, step = float(trials[1] - trials[0]), float(np.median(np.diff(time)))
     spread = weights @ (trials - mean) ** 2 / weights.sum() + (grid**2 + step**2) / 12.0
-    return Rise(mean, float(np.sqrt(spread)))
+    return mean, float(np.sqrt(spread))
 
 
 def _first_rise(values: Array, level: float) -> slice:

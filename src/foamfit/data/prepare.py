@@ -14,7 +14,6 @@ from foamfit.arrays import Array, means
 from foamfit.data import contact, cycles, frames, zeros
 from foamfit.data import outliers as repair
 from foamfit.data.calibration import with_gravity
-from foamfit.data.contact import Rise, rise_of
 from foamfit.data.measurement import (
     MEASURED,
     MIN_ROWS,
@@ -138,7 +137,7 @@ def condition(
         cycle=used.number,
         cycles=tuple(cycle.number for cycle in found) or (1,),
         last_cycle=used.last,
-        rise=rise and rise._replace(time=rise.time - contact_time),
+        rise=rise and (rise[0] - contact_time, rise[1]),
         flight=flight,
     )
     return with_gravity(test) if impact else test
@@ -204,21 +203,18 @@ def _measured(
     )
 
 
-def first_rise(record: Record, start: contact.Start, levels: contact.Levels) -> Rise | None:
+def first_rise(record: Record, start: contact.Start, levels: contact.Levels) -> contact.Kink | None:
     """Return the file's time of contact by the first rise of the stress, or of a gauge at rest.
 
     The zeros of `record` are taken off.
     """
     moved = start.by == "motion" and start.gauge == "rest"
     name = "displacement" if moved else "stress"
-    if name in record.derived and record.acceleration is not None:
-        name = "acceleration"
-    values = record.channel(name)
+    values, zero = record.channel(name), record.zeros.get(name)
     if values is None or name in record.derived:
         return None
-    zero = record.zeros.get(name)
-    rise = rise_of(record.instants, values, levels[name], start.resting, zero)
-    return rise and rise._replace(time=rise.time + record.origins.get("contact_time", 0.0))
+    rise = contact.rise_of(record.instants, values, levels[name], start.resting, zero)
+    return rise and (rise[0] + record.origins.get("contact_time", 0.0), rise[1])
 
 
 def cut_to_contact(record: Record, start: contact.Start, span: zeros.Span) -> Record:
