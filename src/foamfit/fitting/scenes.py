@@ -231,10 +231,6 @@ class Scenes:
                 out[curve][1 + row] = self._by_nuisance(name, curve, rows, at, wanted)
         return out, motion
 
-    def _is_damped(self, springs: Array) -> bool:
-        """Return whether a spring has a dashpot."""
-        return any(springs.item(i) != 0.0 for i in self._dashpots)
-
     def _by_nuisance(
         self, name: str, curve: str, rows: Array, at: dict[str, float], wanted: Wanted
     ) -> Array:
@@ -270,7 +266,8 @@ class Scenes:
             raise SimulationError("the parameters are not admissible")
         if self._largest - at.get("displacement_zero", 0.0) >= height:
             raise SimulationError("the measured strain would reach one with this displacement_zero")
-        damped = wanted.damped or self._is_damped(springs)  # dashpots at zero are omitted
+        # Dashpots at zero are omitted.
+        damped = wanted.damped or any(springs.item(i) != 0.0 for i in self._dashpots)
         drag /= height
 
         def run(plan: Plan, shown: bool) -> Motion:
