@@ -146,10 +146,10 @@ def test_only_frames_are_fitted_and_the_others_are_no_outliers(tmp_path):
         test, "bistable", "impact", params=None, weights=None, interior_mass=False
     )
     objective = problem.objective
-    assert objective.kept("displacement_time").tolist() == taken(test).tolist()
-    assert objective.kept("stress_time").size == test.time.size
+    assert objective.kept["displacement_time"].tolist() == taken(test).tolist()
+    assert objective.kept["stress_time"].size == test.time.size
     assert objective.n_measured("displacement_time") == taken(test).size
-    assert objective.n_data == sum(objective.kept(name).size for name in objective.counted)
+    assert objective.n_data == sum(objective.kept[name].size for name in objective.counted)
 
 
 def test_the_digest_covers_both_files(tmp_path):

@@ -89,7 +89,8 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
         return None
     level, rows = mean_level(values[-n:], noise), np.arange(n, dtype=np.float64)
     slope = level_on_line(rows, values[-n:], 0.0, noise)[1]
-    if abs(slope.value) > _FLAT * slope.error or _is_bent(rows, values[-n:], noise):
+    bend, error = _bend(rows, values[-n:], noise)
+    if abs(slope.value) > _FLAT * slope.error or abs(bend) > _FLAT * error:
         return None
     while n + step < len(values) // 2:
         more = mean_level(values[-n - step : -n], noise)
@@ -104,11 +105,10 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
     return level if abs(level.value) < _HIGHEST * float(np.ptp(values)) else None
 
 
-def _is_bent(rows: Array, values: Array, noise: NoiseLevel) -> bool:
-    """Return whether samples follow a parabola and not a line."""
+def _bend(rows: Array, values: Array, noise: NoiseLevel) -> tuple[float, float]:
+    """Return the quadratic coefficient of samples, and its standard error."""
     (bend, *_), variance = np.polyfit(rows, values, 2, cov="unscaled")
-    sigma = noise.sigma * float(np.sqrt(noise.time))
-    return bool(abs(bend) > _FLAT * sigma * float(np.sqrt(variance[0, 0])))
+    return float(bend), noise.sigma * float(np.sqrt(noise.time * variance[0, 0]))
 
 
 def take_zeros(
@@ -286,9 +286,7 @@ def flight_of(
     gain = percent(share := GRAVITY * float(record.instants[span.end - 1] - start.time) / given)
     if w is not None and n >= 8:
         noise, t = levels["displacement"], record.instants[:n] - start.time
-        (half, *_), variance = np.polyfit(t, w[:n], 2, cov="unscaled")
-        sigma = noise.sigma * float(np.sqrt(noise.time))
-        gravity, error = 2.0 * float(half), 2.0 * sigma * float(np.sqrt(variance[0, 0]))
+        gravity, error = (2.0 * half for half in _bend(t, w[:n], noise))
         none = start.gauge == "flight" and 4.0 * error < GRAVITY
         if falls := gravity > 4.0 * error and abs(gravity - GRAVITY) < 0.2 * GRAVITY + 2.0 * error:
             text = (

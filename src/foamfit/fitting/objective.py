@@ -138,8 +138,9 @@ class Objective:
             name: level.sigma if (level := self.noise(name)).given else max(level.sigma, floor)
             for name, floor in least.items()
         }
-        self._kept = {name: self._samples(name) for name in self.measured}
-        self.sizes = tuple(self._kept[name].size for name in self.counted)
+        # Indices of the samples of each curve that are in the residual.
+        self.kept = {name: self._samples(name) for name in self.measured}
+        self.sizes = tuple(self.kept[name].size for name in self.counted)
         self.n_data = sum(self.sizes)
         self.penalty = max(PENALTY * self.span(name) for name in self.counted)
         self._set_targets()
@@ -149,7 +150,7 @@ class Objective:
         ends = np.cumsum((0, *self.sizes)).tolist()
         every = [size == self.time.size for size in self.sizes]
         self._parts = [  # curve, samples, factor, place in the residual
-            (name, slice(None) if all_ else self.kept(name), self.factor(name), slice(first, end))
+            (name, slice(None) if all_ else self.kept[name], self.factor(name), slice(first, end))
             for name, all_, first, end in zip(self.counted, every, ends[:-1], ends[1:], strict=True)
         ]
         self._unzeroed = {name: self._open_zero(name) for name in self.interior}
@@ -170,14 +171,14 @@ class Objective:
         error = self.measurement.zeros.get(channel_of(name))
         if error is None:
             return 1.0
-        return 1.0 - 1.0 / math.sqrt(1.0 + self._kept[name].size * (error * self.factor(name)) ** 2)
+        return 1.0 - 1.0 / math.sqrt(1.0 + self.kept[name].size * (error * self.factor(name)) ** 2)
 
     def as_read(self, name: str, curve: Array) -> Array:
         """Return a simulated curve, that of an interior motion with the zero of its gauge, SI."""
         share = self._unzeroed.get(name)
         if not share:
             return curve
-        return curve + share * float((self.measured[name] - curve)[self._kept[name]].mean())
+        return curve + share * float((self.measured[name] - curve)[self.kept[name]].mean())
 
     def thinned(self) -> Objective:
         """Return the objective of a few hundred samples, or this one if it has no more.
@@ -404,10 +405,6 @@ class Objective:
         """Return the measured range of a curve, in units of its residual."""
         return float(np.ptp(self.measured[name])) * self.factor(name)
 
-    def kept(self, name: str) -> NDArray[np.intp]:
-        """Return the indices of the samples of a curve that are in the residual."""
-        return self._kept[name]
-
     def n_measured(self, name: str) -> int:
         """Return the number of measured samples of a curve, outliers included."""
         taken = self.measurement.sampled.get(channel_of(name))
@@ -449,5 +446,5 @@ class Objective:
         measured, simulated = self.measured.get(name), curves.curves.get(name)
         if measured is None or simulated is None:
             return None
-        miss = (self.as_read(name, simulated) - measured)[self._kept[name]]
+        miss = (self.as_read(name, simulated) - measured)[self.kept[name]]
         return float(np.sqrt(np.mean(miss**2)) / np.ptp(measured))

@@ -332,7 +332,7 @@ def _by_motion(problem: Problem, point: Array) -> dict[str, Array]:
     share = np.minimum(1.0, level.sigma / np.maximum(size, 1e-300))
     samples = np.arange(objective.time.size)
     for name, part in objective.by_curve(np.linalg.norm(changes, axis=1)).items():
-        sigma = np.interp(samples, objective.kept(name), part / objective.factor(name))
+        sigma = np.interp(samples, objective.kept[name], part / objective.factor(name))
         out[name] = NORMAL * share * sigma
     return out
 
@@ -361,7 +361,7 @@ def _curve(
     contained = {"scatter", "parameters"} if drawn else {"scatter"}  # in the draws
     more = sum(parts[part] ** 2 for part in parts.keys() - contained)
     kept = np.zeros(n, dtype=bool)
-    kept[objective.kept(name)] = True
+    kept[objective.kept[name]] = True
     return PredictedCurve(
         channel=channel,
         unit="m" if channel.startswith("displacement") else "Pa",

@@ -395,7 +395,7 @@ def cycle_growth(best: BestPoint) -> float | None:
     if len(spans) < 2 or not best.names:
         return None
     last = spans[max(spans)]
-    kept = np.concatenate([objective.kept(name) for name in objective.counted])
+    kept = np.concatenate([objective.kept[name] for name in objective.counted])
     return growth(
         best.jacobian, best.residual, np.flatnonzero((kept >= last.start) & (kept < last.stop))
     )

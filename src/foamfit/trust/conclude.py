@@ -140,7 +140,7 @@ def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[st
             "law_error_evidence": error.evidence if error else None,
             "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,
             "motion_smoothed": objective.drive == "displacement" and objective.motion is not None,
-            "residual_q95": float(np.quantile(np.abs(residual[objective.kept(name)]), 0.95)),
+            "residual_q95": float(np.quantile(np.abs(residual[objective.kept[name]]), 0.95)),
         }
     return out
 

@@ -70,7 +70,7 @@ def predicted_misfit(best: BestPoint, deadline: float | None = None) -> float:
     problem, objective = best.problem, replace(best.problem.objective, weighing=None)
     space, tracker = problem.space(), Tracker(objective, deadline)
     block = np.arange(objective.time.size) * BLOCKS // objective.time.size
-    of_sample = np.concatenate([block[objective.kept(name)] for name in objective.counted])
+    of_sample = np.concatenate([block[objective.kept[name]] for name in objective.counted])
     of_sample = np.append(of_sample, np.full(len(objective.priors), BLOCKS))  # in no block
     start, predicted = space.encode(best.values), np.empty(of_sample.size)
     for held_out in range(BLOCKS):
@@ -129,7 +129,7 @@ class Tried:
     def places(self) -> list[NDArray[np.str_]]:
         """Branches of the springs at each fitted sample of each curve."""
         branches = branch_of_samples(self.best.problem, self.best.simulated)
-        return [branches[self.best.problem.objective.kept(name)] for name in self.counted]
+        return [branches[self.best.problem.objective.kept[name]] for name in self.counted]
 
     def states(self, state: str) -> tuple[str, ...]:
         """Return the names of the parameters in a state."""

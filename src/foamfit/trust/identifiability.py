@@ -144,7 +144,7 @@ def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
     for curve, slopes in objective.by_curve(best.scaled).items():
         rows = slopes / (objective.factor(curve) * noise[curve])
         for label in dict.fromkeys(labels.tolist()):
-            triangle = np.linalg.qr(rows[labels[objective.kept(curve)] == label], mode="r")
+            triangle = np.linalg.qr(rows[labels[objective.kept[curve]] == label], mode="r")
             parts.append((curve, label))
             triangles.append(np.pad(triangle, ((0, k - len(triangle)), (0, 0))))
     return Insight(
