@@ -212,15 +212,6 @@ class Decision:
     ruled_out_by: tuple[int | None, ...]  # see `Score.rules_out`; None if not ruled out
 
 
-def scores_of(tried: Sequence[Tried]) -> list[Score]:
-    """Return the scores of all models; if any has no prediction, fitted misfits replace all."""
-    complete = all(one.predicted is not None for one in tried)
-    return [
-        Score(one.varied, one.misfit, (one.predicted if complete else None) or one.misfit)
-        for one in tried
-    ]
-
-
 def decide(scores: Sequence[Score], criteria: Sequence[Criteria], by_prediction: bool) -> Decision:
     """Compare the models in the order of their number of parameters; see `choose`."""
     before: list[int | None] = [None] * len(scores)
@@ -241,8 +232,12 @@ def choose(tried: Sequence[Tried]) -> Decision:
     """Choose the simplest model that no richer one beats.
 
     AICc and BIC decide if at least one model reaches the noise, otherwise the misfit of held-out
-    samples.
+    samples, or the fitted misfit if any model has no prediction.
     """
     reference = reference_of(tried)
     by_noise = [criteria(one, reference) for one in tried]
-    return decide(scores_of(tried), by_noise, all(one.errs for one in tried))
+    predicted = [one.predicted or one.misfit for one in tried]
+    if any(one.predicted is None for one in tried):
+        predicted = [one.misfit for one in tried]
+    scores = [Score(one.varied, one.misfit, p) for one, p in zip(tried, predicted, strict=True)]
+    return decide(scores, by_noise, all(one.errs for one in tried))
