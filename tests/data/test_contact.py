@@ -389,8 +389,9 @@ def test_the_standard_error_covers_the_true_contact(kind, noise, rows):
         values = clean + noise * rng.standard_normal(time.size)
         before = int(np.searchsorted(time, CONTACT))
         values -= values[: before - 2].mean()
-        found = rise_of(time, values, estimated_noise(values), before - 2, noise / before**0.5)
-        assert found.error > 0.2 * step
-        off.append((found.time - CONTACT) / found.error)
+        noise_of_zero = noise / before**0.5
+        contact, error = rise_of(time, values, estimated_noise(values), before - 2, noise_of_zero)
+        assert error > 0.2 * step
+        off.append((contact - CONTACT) / error)
     assert np.max(np.abs(off)) < 4.0
     assert np.sqrt(np.mean(np.square(off))) < 1.7
