@@ -89,6 +89,16 @@ def fitted():
     return ff.fit(loop(seed=99), model="microscale", starts=3, intervals="local")
 
 
+def test_a_band_that_fails_is_told(fitted):
+    def told(measurement):
+        warned = ff.predict(fitted, measurement, draws=DRAWS).warnings
+        return [one for one in warned if "of the samples of stress lie inside the 95 % band" in one]
+
+    assert not told(loop(seed=1))
+    [said] = told(loop(seed=1, sigma_plus=1.1 * LAW["s1_sigma_plus"]))
+    assert "held out differs from" in said
+
+
 def test_the_band_holds_held_out_noise(fitted):
     shares = [
         ff.predict(fitted, loop(seed=seed), draws=DRAWS).inside["stress_strain"]

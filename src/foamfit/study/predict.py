@@ -42,6 +42,9 @@ TRIES = 5  # largest number of attempts per draw
 BAND = (0.025, 0.975)
 # Number of tests that gives no warning; fewer suffice if fewer parameters scatter.
 FEW_TESTS = 5
+# Least fraction of the samples inside the band that gives no warning. It is below 0.95, as an error
+# of a parameter moves many samples together.
+LEAST_INSIDE = 0.8
 ALIGNING = 40  # iterations of the fit of nuisance parameters
 
 
@@ -132,6 +135,7 @@ def predict(
         scattering=changing,
         held=population.held,
         untold=[c.channel for c in curves.values() if c.channel not in source.misses],
+        missed=[curve for curve in curves.values() if curve.inside < LEAST_INSIDE],
         drawn=len(values) if changing else draws,
         draws=draws,
     )
