@@ -131,11 +131,11 @@ class BestPoint:
         """Return the arguments of `curve_errors`; `taken` is the noise absorbed by a joint fit."""
         objective = self.problem.objective
         # Noise of a driving stress, or of a velocity before its integration, has slow waves.
-        test, curves = self.problem.measurement, range(len(objective.counted))
-        slow = set(curves) if objective.drive == "stress" else set[int]()
-        if objective.drive == "impact" and is_velocity(test):
+        slow = set(range(len(objective.sizes))) if objective.drive == "stress" else set[int]()
+        if objective.drive == "impact" and is_velocity(test := self.problem.measurement):
             every = "stress" in test.derived
-            slow = {i for i in curves if every or objective.counted[i] == "displacement_time"}
+            motion = "displacement_time"
+            slow = {i for i, curve in enumerate(objective.counted) if every or curve == motion}
         return self.residual, self.scaled, objective.sizes, taken, slow
 
     @property
