@@ -38,7 +38,7 @@ AT_LIMIT = 1e-6
 SINGULAR = 1e-12
 # Ratios of the curvature of the cost to JᵀJ: the least one, as smaller ones are due to kinks, and
 # the scatter that kinks cause.
-FLATTEST, KINKED = 0.1, 1.0
+FLATTEST, KINKED = 0.5, 1.0
 
 
 @dataclass(frozen=True, eq=False)
