@@ -112,7 +112,7 @@ def solve_loose(c, g, i0, i1, reach, push, y):  # type: ignore[no-untyped-def]
         s = spring(c, flat)
         common = s.gain * s.sigma_high + s.offset
     else:
-        root(c, i0, i1, rest, common, -math.inf, math.inf, 1)
+        root(c, i0, i1, rest, common, -math.inf, math.inf, 0, 1)
         return
     for i in range(i0, i1):
         s = spring(c, i)

@@ -38,9 +38,9 @@ def strain_at(c, i, sigma):  # type: ignore[no-untyped-def]
 
 @inner
 def elongation_at(c, i0, i1, sigma, loose):  # type: ignore[no-untyped-def]
-    """Return elongation, compliance, and size of the terms at a stress on the branches.
+    """Bring springs to a stress on their branches; return elongation, compliance, size of terms.
 
-    With `loose`, only of the springs without a dashpot.
+    With `loose`, only the springs without a dashpot.
     """
     total = compliance = size = 0.0
     for i in range(i0, i1):
@@ -48,6 +48,7 @@ def elongation_at(c, i0, i1, sigma, loose):  # type: ignore[no-untyped-def]
         if loose and s.eta > 0.0:
             continue
         eps = strain_at(c, i, sigma)
+        put(c, i, eps, sigma)
         total += s.height * eps
         compliance += s.height * s.soft / s.gain
         size += s.height * max(abs(eps), LEAST)
@@ -71,35 +72,41 @@ def _split_jump(c, i0, i1, target, low, high, loose):  # type: ignore[no-untyped
 
 
 @inner
-def root(c, i0, i1, target, sigma, low, high, loose):  # type: ignore[no-untyped-def]
-    """Return the stress between two bounds at which springs reach an elongation; fill strains.
+def root(c, i0, i1, target, sigma, low, high, end, loose):  # type: ignore[no-untyped-def]
+    """Bring springs to an elongation; return the stress, and whether the root lies beyond `end`.
 
-    Newton's method inside a bracket, which every third trial halves.
+    Newton's method inside a bracket of stresses, which every third trial halves. The root may lie
+    above the upper bound if `end` is 1, and below the lower one if it is -1; otherwise 0.
     """
     for trial in range(400):
         total, compliance, size = elongation_at(c, i0, i1, sigma, loose)
         miss = total - target
+        if (end > 0 and sigma == high) or (end < 0 and sigma == low):
+            if miss * end < 0.0:
+                return sigma, 1 + c.none
+            end = 0
         if abs(miss) <= 2e-15 * (size + abs(target)):
-            break
+            return sigma, c.none
         if miss > 0.0:
             high = min(high, sigma)
         else:
             low = max(low, sigma)
         new = sigma - miss / compliance
         if not low < new < high or (trial >= 8 and trial % 3 == 0):
-            if low > -math.inf and high < math.inf:
+            beyond = (end > 0 and new >= high) or (end < 0 and new <= low)
+            if low > -math.inf and high < math.inf and not beyond:
                 new = 0.5 * (low + high)
-            elif not low < new < high:
+            elif not low < new < high and not beyond:
                 new = sigma + (2.0 if miss < 0.0 else -2.0) * max(
                     abs(sigma), abs(miss / compliance)
                 )
-            if new in (low, high):  # neighbouring floating-point numbers
-                return _split_jump(c, i0, i1, target, low, high, loose)
+            if end != 0 and (beyond or new in (low, high)):
+                new = high if end > 0 else low
+            elif new in (low, high):  # neighbouring floating-point numbers
+                return _split_jump(c, i0, i1, target, low, high, loose), c.none
         sigma = new
-    for i in range(i0, i1):
-        if not (loose and spring(c, i).eta > 0.0):
-            put(c, i, strain_at(c, i, sigma), sigma)
-    return sigma
+    elongation_at(c, i0, i1, sigma, loose)
+    return sigma, c.none
 
 
 # ---------------------------------------------------------------- along a history
@@ -170,23 +177,26 @@ def bring(c, i0, i1, target, common, y):  # type: ignore[no-untyped-def]
             continue
         if rest == 0.0:
             break
-        limit = math.inf if up else -math.inf
+        limit, compliance = math.inf if up else -math.inf, 0.0
         for i in range(i0, i1):
             s = spring(c, i)
             limit = min(limit, s.sigma_high) if up else max(limit, s.sigma_low)
+            compliance += s.height * s.soft / s.gain
         limit = max(limit, common) if up else min(limit, common)
-        if abs(limit) < math.inf:
-            reached, _, _ = elongation_at(c, i0, i1, limit, c.none)
-            if (target > reached) if up else (target < reached):
-                common = limit
-                for i in range(i0, i1):
-                    put(c, i, strain_at(c, i, limit), limit)
-                for i in range(i0, i1):
-                    s = spring(c, i)
-                    if (s.sigma_high <= limit) if up else (s.sigma_low >= limit):
-                        change_branch(c, i, int(up), y)
-                continue
-        return root(c, i0, i1, target, common, min(common, limit), max(common, limit), c.none)
+        ended = abs(limit) < math.inf
+        # The compliance may be that of the branch before, as it only gives the first trial.
+        start = common + rest / compliance if compliance > 0.0 else common
+        if not min(common, limit) < start < max(common, limit):
+            start = limit if ended and (start > limit) == up else common
+        bounds = min(common, limit), max(common, limit)
+        end = (1 if up else -1) if ended else 0
+        common, beyond = root(c, i0, i1, target, start, *bounds, end, c.none)
+        if not beyond:
+            return common
+        for i in range(i0, i1):
+            s = spring(c, i)
+            if (s.sigma_high <= limit) if up else (s.sigma_low >= limit):
+                change_branch(c, i, int(up), y)
     return common
 
 
