@@ -356,7 +356,7 @@ class Objective:
         # The stress may be huge near the pole of branch c.
         bounded = np.maximum(np.minimum(off, self.penalty), -self.penalty)
         bounded = bounded if self.weighing is None else self.weighing(bounded)
-        return np.append(bounded, self.off_priors(values)) if self.priors else bounded
+        return np.concatenate((bounded, self.off_priors(values))) if self.priors else bounded
 
     def off_priors(self, values: Array) -> Array:
         """Return the deviations of parameters from their priors, in standard deviations."""
