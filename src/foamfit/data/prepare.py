@@ -20,6 +20,7 @@ from foamfit.data.measurement import (
     Dropped,
     Measurement,
     Noise,
+    NoiseLevel,
     Outliers,
     Record,
     RowCount,
@@ -119,11 +120,7 @@ def condition(
     block = -(-len(whole) // len(record))
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
-    if is_velocity(whole) and (impact or "stress" in whole.derived):
-        assert whole.time is not None
-        assert whole.velocity is not None
-        step = float(np.median(np.diff(whole.time)))
-        noise["displacement"] = noise_of_integral(whole.velocity, step)
+    noise |= _of_velocity(whole, impact=impact)
     contact_time = whole.origins.get("contact_time", 0.0)
     test = _measured(
         whole,
@@ -141,6 +138,19 @@ def condition(
         flight=flight,
     )
     return with_gravity(test) if impact else test
+
+
+def _of_velocity(record: Record, *, impact: bool) -> dict[str, NoiseLevel]:
+    """Return the noise of a motion that was integrated from a velocity.
+
+    A slow record of force and velocity shows the noise of its motion itself.
+    """
+    if not is_velocity(record) or not (impact or "stress" in record.derived):
+        return {}
+    assert record.time is not None
+    assert record.velocity is not None
+    step = float(np.median(np.diff(record.time)))
+    return {"displacement": noise_of_integral(record.velocity, step)}
 
 
 def _stated_of_blocks(stated: Noise, levels: contact.Levels, record: Record, block: int) -> Noise:
