@@ -35,8 +35,9 @@ _FLAT = 3.5  # most slope of a flat end, in standard errors
 _HIGHEST = 0.1  # highest level of the end, as a share of the range
 _DRIFTS = 0.005  # share of its range by which a stress that drifts changes at least
 _MATTERS = 0.01  # relative gain of velocity in a fall above which gravity must be specified
+# Part of a note if nothing says whether the striker falls; `with_gravity` searches for it.
+UNKNOWN_FALL = "does not show whether this one falls"
 # Part of a note if motion and given velocity are inconsistent; the checklist searches for it.
-UNKNOWN_FALL = "does not show whether this one falls"  # part of a note
 CONTRADICTED = "but the striker's velocity is given as"
 
 

@@ -253,7 +253,7 @@ def _of_priors(best: BestPoint, estimates: Estimates, with_error: Sequence[str])
             problem.objective.n_data + problem.objective.priors.index(prior)
         )
         rows, residual = columns[others], best.residual[others]
-        move = sizes * np.linalg.lstsq(rows * sizes, -residual, rcond=1e-10)[0]
+        move = _step(rows, residual, sizes)
         error = float(covariance(rows, residual, problem.objective.sizes, sizes).stderr[place])
         low, high = estimates[prior.name].range or (0.0, 0.0)
         error, alone = max(error, 0.25 * (high - low)), best.value(prior.name) + float(move[place])
@@ -339,9 +339,14 @@ def _one_step(
     problem, residual = best.problem, best.residual
     jacobian = np.column_stack([best.jacobian[:, [*map(best.names.index, with_error)]], column])
     sizes = np.append(problem.sizes(tuple(with_error), best.values), size)
-    move = sizes * np.linalg.lstsq(jacobian * sizes, -residual, rcond=1e-10)[0]
+    move = _step(jacobian, residual, sizes)
     left = residual + jacobian @ move
     if left @ left >= 0.8 * float(residual @ residual):
         return None
     spread = covariance(jacobian, left, problem.objective.sizes, sizes)
     return float(move[-1]) if abs(move[-1]) > 4.0 * spread.stderr[-1] else None
+
+
+def _step(jacobian: Array, residual: Array, sizes: Array) -> Array:
+    """Return the Gauss-Newton step of parameters with the scales `sizes`."""
+    return np.asarray(sizes * np.linalg.lstsq(jacobian * sizes, -residual, rcond=1e-10)[0])

@@ -94,16 +94,18 @@ def root(c, i0, i1, target, sigma, low, high, end, loose):  # type: ignore[no-un
         new = sigma - miss / compliance
         if not low < new < high or (trial >= 8 and trial % 3 == 0):
             beyond = (end > 0 and new >= high) or (end < 0 and new <= low)
-            if low > -math.inf and high < math.inf and not beyond:
+            if beyond:
+                new = high if end > 0 else low
+            elif low > -math.inf and high < math.inf:
                 new = 0.5 * (low + high)
-            elif not low < new < high and not beyond:
+            elif not low < new < high:
                 new = sigma + (2.0 if miss < 0.0 else -2.0) * max(
                     abs(sigma), abs(miss / compliance)
                 )
-            if end != 0 and (beyond or new in (low, high)):
+            if not beyond and new in (low, high):  # neighbouring floating-point numbers
+                if end == 0:
+                    return _split_jump(c, i0, i1, target, low, high, loose), c.none
                 new = high if end > 0 else low
-            elif new in (low, high):  # neighbouring floating-point numbers
-                return _split_jump(c, i0, i1, target, low, high, loose), c.none
         sigma = new
     elongation_at(c, i0, i1, sigma, loose)
     return sigma, c.none
@@ -186,11 +188,11 @@ def bring(c, i0, i1, target, common, y):  # type: ignore[no-untyped-def]
         ended = abs(limit) < math.inf
         # The compliance may be that of the branch before, as it only gives the first trial.
         start = common + rest / compliance if compliance > 0.0 else common
-        if not min(common, limit) < start < max(common, limit):
+        low, high = min(common, limit), max(common, limit)
+        if not low < start < high:
             start = limit if ended and (start > limit) == up else common
-        bounds = min(common, limit), max(common, limit)
         end = (1 if up else -1) if ended else 0
-        common, beyond = root(c, i0, i1, target, start, *bounds, end, c.none)
+        common, beyond = root(c, i0, i1, target, start, low, high, end, c.none)
         if not beyond:
             return common
         for i in range(i0, i1):
