@@ -31,7 +31,7 @@ NEAR, CLOSE, TRIALS = 1e-7, 100.0, 4
 EQUAL = 1e-9  # difference between the stresses of two springs over their scale
 # Largest cubic term over the tolerance, as its own error is of higher order. Largest parabola where
 # derivatives are computed, over its power: a search needs fewer digits of them than a simulation.
-CUBIC, PARABOLA, POWER = 2.0, 2e4, 1.5
+CUBIC, PARABOLA, POWER = 2.0, 2.5e3, 1.25
 SHORTEST = 0.15  # share of the rest of a piece; shorter steps would cost more than one of order 8
 # Change of a strain rate, over its sizes at both ends of a step, above which the law bends sharply
 # between them; what then counts as the error.
