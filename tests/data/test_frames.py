@@ -191,7 +191,7 @@ def test_a_motion_is_no_test_of_its_own(tmp_path):
         (MOTION + 'delay = "0 ± -5 us"\n', ["[motion] delay", "must not be negative"]),
         (MOTION + 'delay = "0 us ± 5 %"\n', ["[motion] delay", "less than the value"]),
         (MOTION + 'delay = "0 us ± 5 um"\n', ["[motion] delay", "± has the wrong dimension"]),
-        (MOTION + 'delay = "5 ms"\n', ["[motion] delay = 5 ms is longer than the record, 4 ms"]),
+        (MOTION + 'delay = "5 ms"\n', ["does not overlap in time", "0 s to 4 ms", "5 ms to 9 ms"]),
         (MOTION + 'delay = "0 ± 5 ms"\n', ["[motion] ± of delay = 5 ms is longer"]),
         (
             MOTION + 'delay = "3.95 ms"\n',

@@ -150,9 +150,10 @@ def test_noise_about_a_flat_peak_does_not_move_it():
     assert np.std(rates) < 8.0
 
 
-def test_a_hold_at_the_largest_strain_is_no_loading():
+@pytest.mark.parametrize("end", [3.0, 4.0, 20.0])
+def test_a_hold_at_the_largest_strain_is_no_loading(end):
     time = np.linspace(0.0, 30.0, 3001)
-    strain = np.interp(time, [0.0, 2.0, 20.0, 30.0], [0.0, 0.5, 0.5, 0.0])
+    strain = np.interp(time, [0.0, 2.0, end, 30.0], [0.0, 0.5, 0.5, 0.0])
     noisy = strain + 1e-4 * np.random.default_rng(0).standard_normal(time.size)
     assert loading_rate(moved(time, noisy)) == pytest.approx(0.25, rel=0.02)
 

@@ -173,9 +173,10 @@ def plan(
         foamfit plan foam-1/model-2
     """
     output.check(without_report=False)
-    name = Path(results[0]).resolve()
-    own = name.name if (name / "joint.json").is_file() else name.parent.name
-    default = own if name.is_dir() else results[0].replace("/", "-")
+    place = Path(results[0]).resolve()
+    by_test = place.parent.parent.name == "fits"  # fits/<test>/<model>
+    own = place.parent.name if by_test else place.name
+    default = own if place.is_dir() else results[0].replace("/", "-")
     folder = output.folder(Path("plans", default), "plan.json")
     from foamfit.study import plan as study
 

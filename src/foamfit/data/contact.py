@@ -282,7 +282,8 @@ def rise_of(
     if rest >= MIN_REST and (scatter := noise_about(values[:rest], 1))[0] > sigma:
         sigma, tau = scatter
     size = float(up[-1]) - base
-    width = 1 + up.size // _WINDOWS  # a soft start may be hidden by noise in single samples
+    # A soft start may be hidden by noise in single samples; any length of rest may precede it.
+    width = 1 + (up.size - rest) // _WINDOWS
     clear = _CLEAR * sigma * np.sqrt(min(tau / width, 1.0))
     level = min(max(_RISE_SHARE * size, clear), _LARGEST * size)
     part = _first_rise(smooth(up, width) - base, level)

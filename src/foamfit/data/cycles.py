@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +31,8 @@ _BEGUN = 3.0  # multiple of the least load above which the first rise has certai
 
 # Rate
 _AT_PEAK = 3.0  # samples within this many standard deviations below the largest may be the peak
-_CLOSE = 0.95  # share of the peak; a motion is held if it takes longer from there than up to there
+_CLOSE = 0.95  # share of the peak from which a parabola leads to it
+_HELD = 1.15  # ratio of the middle of a peak to its end on a parabola above which it is a hold
 _FINE = 20  # points per sample of a fitted motion
 
 
@@ -367,7 +369,10 @@ def loading_rate(test: Measurement, fitted: Array | None = None) -> float | None
 
 
 def _velocity(time: Array, motion: Array, sigma: float) -> float | None:
-    """Return the mean velocity up to the peak of a measured motion; None if it never rises."""
+    """Return the mean velocity up to the peak of a measured motion; None if it never rises.
+
+    Where the samples that may be the peak last longer than on a parabola, the motion is held.
+    """
     motion = motion - motion[0]
     most = float(motion.max())
     if most <= 0.0 or time[np.argmax(motion)] <= 0.0:
@@ -377,6 +382,9 @@ def _velocity(time: Array, motion: Array, sigma: float) -> float | None:
     if below.size:  # the peak is that of the first cycle
         time, motion = time[: near + below[0]], motion[: near + below[0]]
         most = float(motion.max())
-    when = float(np.mean(time[motion >= most - _AT_PEAK * sigma]))
-    reached = float(time[np.argmax(motion >= _CLOSE * most)]) / _CLOSE
-    return most / (reached if when > 2.0 * reached > 0.0 else when)
+        near = int(np.argmax(motion >= _CLOSE * most))
+    when, depth = float(np.mean(time[motion >= most - _AT_PEAK * sigma])), 2.0 * _AT_PEAK * sigma
+    close, first = time[near], time[np.argmax(motion >= most - depth)]
+    share = math.sqrt(depth / ((1.0 - _CLOSE) * most))  # of the way from `close` that is left
+    top = float(close + (first - close) / (1.0 - share)) if share < 1.0 else when
+    return most / (top if when > _HELD * top else when)

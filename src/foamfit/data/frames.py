@@ -55,18 +55,17 @@ def join(record: Record, frames: Frames) -> Record:
     If there are fewer frames than samples, the motion at each sample comes from a cubic spline, and
     only the sample nearest to a frame counts as measured. Otherwise frames are averaged or
     interpolated for each sample, and all samples count. Spikes, and samples outside the time of the
-    frames, are dropped. Raises InputError if the two hardly overlap in time, or if the delay is
-    longer than both.
+    frames, are dropped. Raises InputError if the two hardly overlap in time, or if the ± of the
+    delay is longer than both.
     """
     time = record.time
     assert time is not None  # a force without a time was rejected
     longest = max(np.ptp(time), np.ptp(frames.time))
-    for size, what in ((frames.delay, "delay"), (frames.spread or 0.0, "± of delay")):
-        if abs(size) > longest:
-            raise InputError(
-                f"[motion] {what} = {engineering(size, 's')} is longer than the record, "
-                f"{engineering(float(longest), 's')}; it must be shorter."
-            )
+    if (spread := frames.spread or 0.0) > longest:
+        raise InputError(
+            f"[motion] ± of delay = {engineering(spread, 's')} is longer than the record, "
+            f"{engineering(float(longest), 's')}; it must be shorter."
+        )
     at = frames.time + frames.delay
     slack = 1e-9 * longest  # for rounding
     outside = (time < at[0] - slack) | (time > at[-1] + slack)

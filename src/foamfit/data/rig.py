@@ -213,6 +213,8 @@ class Candidate:
         if self.mass is not None:
             lines += ["", "[striker]", f'mass = "{self.mass * 1e3:.6g} g"']
             lines.append(f'velocity = "{self.velocity:.6g} m/s"    # enter the measured velocity')
+            if test.striker is not None and (gravity := test.striker.gravity) is not None:
+                lines.append(f"gravity = {'true' if gravity else 'false'}")
         else:
             lines += ["", f"# Machine: {self}."]
             lines += ["[window]", f"cycles = [1, {self.cycles}]"] if self.cycles > 1 else []

@@ -43,6 +43,7 @@ LARGEST_CONTACT, LARGEST_SHIFT, LARGEST_ZERO = 0.15, 0.1, 0.5
 ALIKE = 1.5
 LARGEST_STRAIN = 0.999  # of the measured motion, with its zero taken off
 _NEAR = 12  # the speed at contact is that over this part of the way to the turn
+_OUTSIDE = 0.1  # of that part: a contact outside the record is far from it
 _LOW = 0.1  # fraction of the peak stress below which a contact may have been overlooked
 
 
@@ -133,14 +134,19 @@ def shown_by(measurement: Measurement, drive: str, *, late: bool = False) -> dic
 
 
 def _motion_at(measurement: Measurement, contact: float) -> tuple[float, float, float]:
-    """Return the motion (m) and its speed at contact, by a line near it, and its noise."""
+    """Return the motion (m) and its speed at contact, and its noise.
+
+    It is a parabola near contact, as the motion may begin there; far outside the record, a line.
+    """
     values, level = measurement.displacement, measurement.noise.of("displacement")
     assert values is not None
     time = np.arange(values.size, dtype=float) if measurement.time is None else measurement.time
     at, top = int(np.searchsorted(time, contact)), int(np.argmax(values))
     reach = max(3, (top - at) // _NEAR)
     near = slice(max(0, at - reach), at + reach + 1)
-    speed, zero = np.polyfit(time[near] - contact, values[near], 1)
+    since = time[near] - contact
+    outside = max(since[0], -since[-1]) > _OUTSIDE * (since[-1] - since[0])
+    *_, speed, zero = np.polyfit(since, values[near], 1 if outside else 2)
     return float(zero), float(speed), 0.0 if level is None else level.sigma
 
 

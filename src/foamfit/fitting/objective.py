@@ -270,9 +270,14 @@ class Objective:
         return level
 
     def _samples(self, name: str) -> NDArray[np.intp]:
-        """Return the indices of the samples that count: measured ones without outliers."""
-        channel = channel_of(name)
-        counts = self.measurement.sampled.get(channel, np.ones(self.time.size, dtype=bool))
+        """Return the indices of the samples that count: measured ones without outliers.
+
+        A stress along a motion that does not drive counts where both were measured.
+        """
+        channel, every = channel_of(name), np.ones(self.time.size, dtype=bool)
+        counts = self.measurement.sampled.get(channel, every)
+        if name == "stress_strain" and not self.driven:
+            counts = counts & self.measurement.sampled.get("displacement", every)
         outliers = self.measurement.outliers.get(channel)
         if self.drive == "stress":
             counts = counts & shows_motion(driving_stress(self.measurement, self.model))

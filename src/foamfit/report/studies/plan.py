@@ -130,7 +130,19 @@ class Plan(Result, OfLaw):
     #: whether force, mass and motion of the record contradict each other as well; an impact of the
     #: same rig then determines nothing
     contradicted: bool
+    drive: str | None  #: of the tests at hand; None: they have several
+    held: dict[str, float]  #: spring parameters that the user has fixed, SI
     seed: int
+
+    @property
+    def not_joined(self) -> str:
+        """Why no study can fit the next test together with the tests at hand; "" if one can."""
+        for one in self.tests:
+            if one.path is None:
+                return f"{one.name} has no record"
+            if one.cycle != min(one.cycles) or one.last_cycle is not None:
+                return f"{one.name} is not the first cycle alone, and a study reads one of each"
+        return ""
 
     @property
     def name(self) -> str:
@@ -218,6 +230,7 @@ class Plan(Result, OfLaw):
         write_json(folder / "plan.json", self.to_json_dict())
         if self.advice is not None:
             write_text(folder / "next.toml", self.advice.candidate.toml(self.tests[0]))
+        if self.advice is not None and not self.not_joined:
             # The folder will have a sibling's place, so relative paths remain valid.
             paths = [os.path.relpath(one.path, folder) for one in self.tests if one.path]
             values = {"files": [*paths, "next.csv"], "read": Model.parse(self.model)}
