@@ -68,7 +68,7 @@ class Contradiction:
     ratio, limit
         Number that the record shows over the number in use, and the largest difference of this
         ratio from 1 of numbers that agree. Of a time shift, the delay of the motion against the
-        force, s, and the largest one that may be noise.
+        force, s, and the largest one that may be noise of the record.
     says
         What contradicts what, a clause.
     lines
@@ -158,8 +158,8 @@ def _of_delay(test: Measurement, delay: Shown | None) -> Iterator[Contradiction]
     if delay is None or test.time is None:
         return
     late, stated = delay[0], test.uncertainties.get("delay", 0.0)
-    limit = max(LATE * math.hypot(delay[1], stated), float(np.median(np.diff(test.time))))
-    if abs(late) > limit:
+    limit = max(LATE * delay[1], float(np.median(np.diff(test.time))))
+    if abs(late) > max(limit, LATE * math.hypot(delay[1], stated)):
         says = f"the motion is {'late' if late > 0.0 else 'early'} against the force by "
         error = float(f"{delay[1]:.2g}")
         says += f"{engineering(abs(late), 's')} ± {engineering(error, 's')}"

@@ -53,6 +53,17 @@ def unreached(problem: Problem, simulated: Simulated) -> dict[str, str]:
     return out
 
 
+def silent(problem: Problem, simulated: Simulated) -> set[str]:
+    """Return the unreached parameters that moved no branch which was reached."""
+    seen = visited(problem, simulated)
+
+    def moved(name: str) -> bool:
+        branch, spring = problem.model.param(name).moves, split_name(name)[0]
+        return branch in covered(seen[f"s{spring + 1}"])
+
+    return {name for name in unreached(problem, simulated) if not moved(name)}
+
+
 def _states(problem: Problem, simulated: Simulated) -> list[tuple[int, dict[int, str]]]:
     """Return the branches of the hysteretic springs (0 = base), and the sample where they begin."""
     laws = problem.model.laws

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array, single_threaded
+from foamfit.data.calibration import contradictions
 from foamfit.data.csv_file import read_test
 from foamfit.data.cycles import cycles_of, loading_rate
-from foamfit.data.measurement import Measurement
+from foamfit.data.measurement import ASKED, Measurement
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError, check_whole
 from foamfit.fitting.curves import (
@@ -22,6 +23,7 @@ from foamfit.fitting.curves import (
     driving_motion,
     is_exact,
 )
+from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.scenes import channel_of
 from foamfit.fitting.search import Tracker, descend
@@ -33,6 +35,7 @@ from foamfit.springs.parameters import unit_of
 from foamfit.study.identified import NORMAL, Source, read_source
 from foamfit.study.population import Population
 from foamfit.text import engineering
+from foamfit.trust import say
 
 DRAWS = 400  # default number of draws of specimens
 FEWEST = 40  # least number of draws: fewer do not resolve the ends of a 95 % band
@@ -136,6 +139,8 @@ def predict(
         held=population.held,
         untold=[c.channel for c in curves.values() if c.channel not in source.misses],
         missed=[curve for curve in curves.values() if curve.inside < LEAST_INSIDE],
+        doubts=_doubts(problem),
+        again=source.sha256 == measurement.data_sha256,
         drawn=len(values) if changing else draws,
         draws=draws,
     )
@@ -184,6 +189,15 @@ def _outside(source: Source, rate: float | None) -> str | None:
         f"its rate, {rate:.3g} 1/s, lies outside the fitted rates, {fitted}, by more than a factor "
         f"of {RATE_FACTOR}"
     )
+
+
+def _doubts(problem: Problem) -> list[str]:
+    """Return what the record of the test contradicts or leaves open, as `foamfit check` does."""
+    test, drive = problem.measurement, problem.objective.drive
+    every = contradictions(test) if drive == "impact" else ()
+    found = [one for one in every if one.quantity != TIME_SHIFT]  # which is fitted, or unknown
+    notes = [note for note in test.notes if note.startswith(ASKED)]
+    return [*(say("contradiction", "said", one=one, drive=drive) for one in found), *notes]
 
 
 def _problem(source: Source, measurement: Measurement, drive: str | None) -> Problem:

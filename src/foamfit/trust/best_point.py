@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import is_velocity
-from foamfit.fitting.branches import unreached
+from foamfit.fitting.branches import silent, unreached
 from foamfit.fitting.links import RATES, factor
 from foamfit.fitting.nuisance import CONTACT_TIME
 from foamfit.fitting.objective import Simulated
@@ -69,10 +69,11 @@ class BestPoint:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the k parameters whose uncertainty is wanted."""
+        """Names of the k parameters on which the curves depend."""
         if self.chosen is not None:
             return self.chosen
-        return tuple(name for name in self.problem.free() if name not in self.unreached)
+        without = silent(self.problem, self.simulated)
+        return tuple(name for name in self.problem.free() if name not in without)
 
     @property
     def index(self) -> dict[str, int]:

@@ -20,6 +20,7 @@ from foamfit.data.zeros import CONTRADICTED
 from foamfit.errors import InputError
 from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
+from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.search import SearchRecord
 from foamfit.parts import ParameterEstimate
 from foamfit.results import Check, Intervals
@@ -39,6 +40,9 @@ STATED, ESTIMATED = 1.1, 1.5
 BOUGHT = 0.02
 # The curves contradict a prior if they differ by more than this many standard deviations of both.
 AGAINST = 3.0
+# The stress is gone below this share of its peak, and a specimen has recovered below this share of
+# the largest strain.
+GONE, RECOVERED = 0.02, 0.5
 # Residuals are correlated if their autocorrelation time, in samples, exceeds this.
 STRUCTURED = 5.0
 # Largest number of reasons in a warning; more are easier to read in the table of parameters.
@@ -93,6 +97,7 @@ def make_checklist(
         _visited(best, estimates),
         *_of_intervals(best, estimates, intervals, with_error),
         *_of_priors(best, estimates, with_error),
+        *_recovery(best),
         *_of_test(best, balance, contradictions),
         _time_shift(best, estimates, contradictions),
         _damping(best, with_error),
@@ -239,12 +244,13 @@ def _of_intervals(
 
 
 def _of_priors(best: BestPoint, estimates: Estimates, with_error: Sequence[str]) -> Iterator[Check]:
-    """Check whether the curves alone agree with each prior of the user, if there are any.
+    """Check whether the curves alone agree with each prior of the user and with a stated delay.
 
     The value without a prior is one linear step away from the best point.
     """
     problem, against = best.problem, list[dict[str, Any]]()
-    given = [prior for prior in problem.objective.given if prior.name in with_error]
+    stated = [prior for prior in problem.objective.priors if prior.name == TIME_SHIFT]
+    given = [one for one in (*problem.objective.given, *stated) if one.name in with_error]
     sizes = problem.sizes(tuple(with_error), best.values)
     columns = best.jacobian[:, [*map(best.names.index, with_error)]]
     for prior in given:
@@ -305,6 +311,32 @@ def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:
     return _check("damping", eta == 0.0, eta=eta)
 
 
+def lost_height(best: BestPoint) -> float:
+    """Return the share of the largest strain at which a slow unloading ends, if it is large.
+
+    0 if the stress lasts below half of the strain, or if the model relaxes or is damped.
+    """
+    test, model = best.problem.measurement, best.problem.model
+    damped = any(best.value(name) for name in model.names if name.endswith("_eta"))
+    if best.problem.objective.drive != "displacement" or model.relaxation or damped:
+        return 0.0
+    assert test.stress is not None
+    assert test.displacement is not None
+    level, peak = test.noise.of("stress"), float(test.stress.max())
+    loaded = test.stress > max(GONE * peak, 4.0 * (level.sigma if level else 0.0))
+    last = int(np.flatnonzero(loaded)[-1]) + 1
+    if last >= loaded.size or test.last_cycle is not None:
+        return 0.0
+    share = float(test.displacement[last] / test.displacement.max())
+    return share if share > RECOVERED else 0.0
+
+
+def _recovery(best: BestPoint) -> Iterator[Check]:
+    """Check whether the specimen follows the motion back, where the law errs."""
+    if best.names and best.misfits and (lost := lost_height(best)):
+        yield _check("recovery", False, lost=lost)
+
+
 def _time_shift(best: BestPoint, estimates: Estimates, found: Sequence[Contradiction]) -> Check:
     """Check what the equation of motion of the striker says of the clocks (`data.calibration`)."""
     test, objective = best.problem.measurement, best.problem.objective
@@ -315,10 +347,12 @@ def _time_shift(best: BestPoint, estimates: Estimates, found: Sequence[Contradic
     if objective.time_shift:
         shift = estimates.get("time_shift")
         facts |= {"held": shift is None or not shift.vary, "shift": shift and shift.value}
-        return _check("time_shift", None if facts["held"] else True, **facts)
     if clocks:
-        warning = say("contradiction", "said", one=clocks[0], drive=objective.drive)
+        stated = objective.time_shift
+        warning = say("contradiction", "said", one=clocks[0], drive=objective.drive, stated=stated)
         return _check("time_shift", False, warnings=[warning], late=clocks[0].ratio, **facts)
+    if objective.time_shift:
+        return _check("time_shift", None if facts["held"] else True, **facts)
     moving = test.striker is not None and test.striker.mass and test.striker.velocity
     facts["moving"] = bool(moving)
     with suppress(InputError):

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from foamfit.data.calibration import contradictions
 from foamfit.data.cycles import inner_loops
 from foamfit.data.energy import audit, noise_sentences
 from foamfit.data.measurement import INTEGRATED, interior_channel
@@ -29,8 +30,15 @@ from foamfit.text import engineering, listed
 from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
 from foamfit.trust.budget import changed, make_budget
-from foamfit.trust.checklist import POOR, make_checklist, may_vanish, status_of, warnings_of
-from foamfit.trust.contested import Settled, judged, settle, unsettled
+from foamfit.trust.checklist import (
+    POOR,
+    lost_height,
+    make_checklist,
+    may_vanish,
+    status_of,
+    warnings_of,
+)
+from foamfit.trust.contested import Settled, judged, of_flight, settle, unsettled
 from foamfit.trust.covariance import Ends
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
@@ -60,10 +68,12 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
     late = best.value(TIME_SHIFT) if objective.time_shift else 0.0
     on_time = changed(measurement, TIME_SHIFT, late) if late else measurement
     balance, misfit = audit(on_time), objective.misfit(simulated)
-    contradictions = unsettled(best, balance.contradictions)
-    settled = settle(best, contradictions)
-    estimates, budget = make_budget(best, _estimates(best, insight, intervals, settled))
-    checklist = make_checklist(best, estimates, misfit, record, balance, intervals, contradictions)
+    found = contradictions(measurement) if late else balance.contradictions
+    contradicted = unsettled(best, found)
+    settled = settle(best, contradicted or of_flight(best))
+    doubts = _doubts(best, record, intervals)
+    estimates, budget = make_budget(best, _estimates(best, insight, intervals, settled, doubts))
+    checklist = make_checklist(best, estimates, misfit, record, balance, intervals, contradicted)
     springs = best.values[: len(problem.model.names)]
     return Fit(
         measurement=measurement,
@@ -75,7 +85,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         chain=problem.model.chain(springs, specimen.height, specimen.area),
         params=problem.told(),
         parameters=estimates,
-        contradictions=contradictions,
+        contradictions=contradicted,
         visited=visited(problem, simulated),
         misfit=misfit,
         weights=objective.weights,
@@ -215,14 +225,33 @@ def _inner_loops(best: BestPoint) -> dict[str, Any] | None:
     return {"spans": spans, "without": without, "others": others, **shares}
 
 
+def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict[str, Any]:
+    """Return what makes all determined parameters weak, for the sentence of `why.weak`."""
+    objective, errs = best.problem.objective, bool(best.names) and best.misfits
+    misfit, curve = max((objective.off(best.simulated, n) or 0.0, n) for n in objective.counted)
+    return {
+        "stopped": not intervals.ranged,
+        "vibrates": objective.interior_mass,
+        "lost": lost_height(best) if errs else 0.0,
+        "alone": errs and record.stopped is None and 0 < record.agreeing < 2,
+        "off": misfit if misfit > POOR else 0.0,
+        "curve": curve,
+    }
+
+
 def _estimates(
-    best: BestPoint, insight: Insight | None, intervals: Intervals, settled: Sequence[Settled]
+    best: BestPoint,
+    insight: Insight | None,
+    intervals: Intervals,
+    settled: Sequence[Settled],
+    doubts: Mapping[str, Any],
 ) -> dict[str, ParameterEstimate]:
     """Return the estimates of all parameters; their standard errors are also set in lmfit's."""
     problem, out = best.problem, {}
     varied = {}
     if insight is not None:
-        varied = {name: _varied(best, name, insight, intervals, settled) for name in best.names}
+        wanted = [name for name in best.names if name not in best.unreached]
+        varied = {n: _varied(best, n, insight, intervals, settled, doubts) for n in wanted}
     for name, value in zip(problem.names, best.values.tolist(), strict=True):
         if problem.is_exact(name):
             continue
@@ -285,7 +314,12 @@ def _of_tied(
 
 
 def _varied(
-    best: BestPoint, name: str, insight: Insight, intervals: Intervals, settled: Sequence[Settled]
+    best: BestPoint,
+    name: str,
+    insight: Insight,
+    intervals: Intervals,
+    settled: Sequence[Settled],
+    doubts: Mapping[str, Any],
 ) -> ParameterEstimate:
     """Return the estimate of a varied parameter whose branch was reached."""
     (low, high), column = best.limits(name), best.names.index(name)
@@ -303,15 +337,11 @@ def _varied(
     if span is not None:  # it may belong to the point before the last improvement
         span = min(span[0], value), max(span[1], value)
     state, why = _state_of(best, name, ends, insight, span)
-    objective, other = problem.objective, intervals.elsewhere.get(name)
     zero = problem.measurement.origins.get(name, 0.0)  # in the numbers of the file
-    misfit, curve = max((objective.off(best.simulated, n) or 0.0, n) for n in objective.counted)
-    doubt = not intervals.ranged or objective.interior_mass or other is not None or misfit > POOR
-    if state == "determined" and doubt:
-        there = None if other is None else other + zero
-        facts = {"vibrates": objective.interior_mass, "there": there, "off": misfit, "curve": curve}
-        facts |= {"ranged": intervals.ranged}
-        state, why = "weak", say("why", "weak", why=why, unit=unit, **facts)
+    if (there := intervals.elsewhere.get(name)) is not None:
+        there += zero
+    if state == "determined" and (there is not None or any({**doubts, "curve": ""}.values())):
+        state, why = "weak", say("why", "weak", why=why, unit=unit, there=there, **doubts)
     state, why = judged(settled, best, name, (ends[0] + zero, ends[1] + zero), (state, why))
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)

@@ -7,13 +7,14 @@ best point is therefore moved, to first order, for each way to settle the contra
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.calibration import Contradiction
 from foamfit.data.measurement import is_clipped
+from foamfit.data.zeros import CONTRADICTED
 from foamfit.fitting import nuisance
 from foamfit.springs.parameters import unit_of
 from foamfit.text import listed
@@ -40,7 +41,10 @@ class Settled:
 
 
 def unsettled(best: BestPoint, found: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
-    """Return the contradictions that the fit does not settle by a parameter or its value."""
+    """Return the contradictions that the fit does not settle by a parameter or its value.
+
+    Of a time shift, only what the fit leaves of it.
+    """
     problem, values = best.problem, dict(zip(best.problem.names, best.values.tolist(), strict=True))
     known = {prior.name for prior in problem.objective.priors}
     free, usual = set(problem.free()) - known, problem.objective.usual
@@ -50,14 +54,30 @@ def unsettled(best: BestPoint, found: Sequence[Contradiction]) -> tuple[Contradi
     # Between masses within the specimen the force is late without a fault of the clocks.
     inert = problem.objective.interior_mass and len(problem.model.kinds) > 1
 
+    late = values.get(nuisance.TIME_SHIFT, 0.0)
+    found = [
+        replace(one, ratio=one.ratio - late) if one.quantity == nuisance.TIME_SHIFT else one
+        for one in found
+    ]
+
     def agrees(one: Contradiction) -> bool:
         if one.quantity == nuisance.TIME_SHIFT:
-            return inert or bool(abs(one.ratio - values.get(nuisance.TIME_SHIFT, 0.0)) <= one.limit)
+            return inert or abs(one.ratio) <= one.limit
         off = {"velocity": (speed,), "force_scale": (force,)}
         wanted = off.get(one.quantity, (1.0 / speed, 1.0 / force))
         return all(abs(one.ratio / ratio - 1.0) <= one.limit for ratio in wanted)
 
     return tuple(one for one in found if not (one.is_settled(free) or agrees(one)))
+
+
+def of_flight(best: BestPoint) -> tuple[Contradiction, ...]:
+    """Return what the flight shows of a velocity that differs by less than a contradiction."""
+    test = best.problem.measurement
+    if test.flight is None or nuisance.VELOCITY in best.problem.free():
+        return ()
+    ratio = test.flight[0] / best.problem.objective.usual[nuisance.VELOCITY]
+    says = [note for note in test.notes if CONTRADICTED in note]
+    return tuple(Contradiction(nuisance.VELOCITY, ratio, 0.0, one, ()) for one in says)
 
 
 def ways(found: Iterable[Contradiction], *, braked: bool) -> list[Way]:

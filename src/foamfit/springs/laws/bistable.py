@@ -275,7 +275,7 @@ LAW = Law(
         Param(
             "eps_c", ("ε", "c"), "", "strain at C2, where snap-back starts", (0.8, "strain"),
             (2e-3, 0.999), "one", _BEYOND_A1, box=(0.002, 1.0), admissible="between 0 and 1",
-            branch="e", example="0.31",
+            branch="e", moves="c", example="0.31",
         ),
         Param(
             "kh_plus", ("k", "h+"), "Pa", "slope of branch d", (1.0, "slope"), (0.0, 100.0),

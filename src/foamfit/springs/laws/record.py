@@ -72,6 +72,7 @@ class Param:
     admissible: str = "positive"  #: one of `ADMISSIBLE`
     neutral: float | None = None  #: value at which the parameter has no effect
     branch: str = ""  #: branch that a test must reach to determine the parameter
+    moves: str = ""  #: another branch, which it moves together with other parameters
     example: str = ""  #: a value with its unit, as in a file
 
     @property
