@@ -9,7 +9,6 @@ from numbers import Real
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
-from scipy.signal import savgol_filter
 
 from foamfit.arrays import Array
 from foamfit.data.calibration import contradictions
@@ -143,23 +142,28 @@ def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> d
     return weights
 
 
-def driving_stress(measurement: Measurement, model: Model) -> Array:
-    """Smooth the measured stress (Pa) of a test that drives a model; it is zero before contact.
-
-    Noise of a driving stress biases the soft branches (errors in variables); a moving parabola over
-    a twenty-fifth of the samples removes it. Loading and unloading have their own, as one across
-    the peak would cut it off. Chains with a unilateral spring carry no tension.
-    """
-    stress, time = measurement.stress, measurement.time
+def smooth_stress(measurement: Measurement, time: Array) -> SmoothMotion | None:
+    """Return the measured stress without its noise, Pa; None if the samples are to be used."""
+    stress, level = measurement.stress, measurement.noise.of("stress")
     assert stress is not None  # checked by check_drive
-    window, begins = 2 * (stress.size // 50) + 1, (measurement.rise or (0.0, 0.0))[0]
-    begin = int(np.searchsorted(np.arange(stress.size) if time is None else time, begins))
-    top = begin + int(np.argmax(stress[begin:]))
-    smooth = np.zeros(stress.size)
-    for part in (slice(begin, top), slice(top, None)):
-        own = stress[part]
-        smooth[part] = savgol_filter(own, window, 2) if own.size > window > 3 else own
-    return np.maximum(smooth, 0.0) if "unilateral" in model.kinds else smooth
+    if level is None or level.sigma <= EXACT * float(np.ptp(stress)):
+        return None
+    found = follow(time, stress, level, measurement.sampled.get("stress"))
+    return found if found.sigma <= FOLLOWED * level.sigma else None
+
+
+def driving_stress(
+    measurement: Measurement, model: Model, time: Array, smooth: SmoothMotion | None
+) -> Array:
+    """Return the stress (Pa) of a test that drives a model; it is zero before contact.
+
+    Noise of a driving stress biases the soft branches (errors in variables), so that it is removed
+    as that of a driving motion. Chains with a unilateral spring carry no tension.
+    """
+    assert measurement.stress is not None  # checked by check_drive
+    stress = measurement.stress if smooth is None else smooth.at(time)
+    stress = np.where(time < (measurement.rise or (0.0, 0.0))[0], 0.0, stress)
+    return np.maximum(stress, 0.0) if "unilateral" in model.kinds else stress
 
 
 def shows_motion(stress: Array) -> NDArray[np.bool_]:

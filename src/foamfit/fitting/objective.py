@@ -28,7 +28,6 @@ from foamfit.fitting.curves import (
     check_drive,
     check_time_shift,
     checked_weights,
-    driving_stress,
     interior_curves,
     is_glued,
     shows_motion,
@@ -237,9 +236,9 @@ class Objective:
 
     def by_motion(self, values: Array) -> Array | None:
         """Return the change of the residual by each mode of the motion, (n_data, m), or None."""
-        if not self.driven or self.motion is None:
+        if self.scenes.smooth is None:
             return None
-        modes = self.motion.modes(self.scenes.clock)
+        modes = self.scenes.smooth.modes(self.scenes.clock)
         out = np.empty((self.n_data, modes.shape[1]))
         for column, mode in zip(out.T, modes.T, strict=True):
             sides = [self._moved_by(side * mode).residual(values) for side in (-0.5, 0.5)]
@@ -280,7 +279,7 @@ class Objective:
             counts = counts & self.measurement.sampled.get("displacement", every)
         outliers = self.measurement.outliers.get(channel)
         if self.drive == "stress":
-            counts = counts & shows_motion(driving_stress(self.measurement, self.model))
+            counts = counts & shows_motion(self.scenes.drives)
         return np.flatnonzero(counts if outliers is None else counts & ~outliers.left_out)
 
     # ------------------------------------------------------------------ simulation and residual

@@ -27,6 +27,7 @@ from foamfit.fitting.curves import (
     instants,
     later,
     moved_at,
+    smooth_stress,
     without_tension,
 )
 from foamfit.solve.plan import Motion, Plan
@@ -124,6 +125,18 @@ class Scenes:
         return self.followed[0] if self.followed else driving_motion(self.measurement, self.time)
 
     @cached_property
+    def smooth(self) -> SmoothMotion | None:
+        """What drives the springs, without its noise: a motion (m) or a stress (Pa), or None."""
+        if self.drive == "stress":
+            return smooth_stress(self.measurement, self.time)
+        return self.motion if self.driven else None
+
+    @cached_property
+    def drives(self) -> Array:
+        """The driving stress, Pa, (n,)."""
+        return driving_stress(self.measurement, self.model, self.time, self.smooth)
+
+    @cached_property
     def _moved(self) -> Array:
         """The measured motion at the simulated instants, m."""
         assert self.measurement.displacement is not None
@@ -156,7 +169,7 @@ class Scenes:
             usual = self.usual
             return Impact(usual[nuisances.STRIKER_MASS], usual[nuisances.VELOCITY], self._gravity)
         if self.drive == "stress":
-            return StressDrive(driving_stress(self.measurement, self.model))
+            return StressDrive(self.drives)
         return DisplacementDrive(self._moved)
 
     def _make(self, loading: Drive) -> dict[bool, Plan]:

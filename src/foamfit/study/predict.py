@@ -126,6 +126,7 @@ def predict(
         parts = {part: of_curves[name] for part, of_curves in halves.items() if name in of_curves}
         curves[name] = _curve(problem, name, simulated.curves[name], drawn, source, parts)
     changing, count = population.scattering, population.fewest
+    later = measurement.last_cycle or measurement.cycle
     warnings = render.sentences(
         "predicted_warnings",
         source=source,
@@ -140,7 +141,7 @@ def predict(
         untold=[c.channel for c in curves.values() if c.channel not in source.misses],
         missed=[curve for curve in curves.values() if curve.inside < LEAST_INSIDE],
         doubts=_doubts(problem),
-        again=source.sha256 == measurement.data_sha256,
+        again=source.sha256 == measurement.data_sha256 and later > 1,
         drawn=len(values) if changing else draws,
         draws=draws,
     )
