@@ -9,7 +9,7 @@ import numpy as np
 
 from foamfit.arrays import Array, Integers
 from foamfit.data.measurement import Measurement, Record
-from foamfit.data.noise import TENSION, noise_level, smooth
+from foamfit.data.noise import TENSION, lowest_mean, noise_level, smooth
 from foamfit.errors import InputError
 from foamfit.text import engineering, percent
 
@@ -227,7 +227,9 @@ def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
     if cycle.last is None:
         return record
     zero, error = _level_between(record, cycles, cycle.place)
-    if zero > -_SURE * error or _is_glued(record, zero, float(record.stress[cycle.top])):
+    between = record.stress[cycles[cycle.place].top : cycles[cycle.place + 1].top]
+    tension = min(zero, lowest_mean(between, 0)[0])
+    if zero > -_SURE * error or _is_glued(record, tension, float(record.stress[cycle.top])):
         return record
     record = replace(record.shifted("stress", zero), zeros=record.zeros | {"stress": error})
     return record.noted(_offset_note("between the first two cycles", zero))

@@ -396,7 +396,7 @@ def checks(
     stress, first = record.stress, record.stress[:3].mean()
     if first > 0.05 * peak:
         load = percent(first / peak)
-        notes.append(f"Check: the record starts under load, at {load} of the peak stress.")
+        notes.append(f"Check: {zeros.UNDER_LOAD}, at {load} of the peak stress.")
     lowest, width = lowest_mean(stress, int(np.argmax(stress)))
     if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
         after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"

@@ -38,6 +38,7 @@ _MATTERS = 0.01  # relative gain of velocity in a fall above which gravity must 
 # Part of a note if nothing says whether the striker falls; `with_gravity` searches for it.
 UNKNOWN_FALL = "does not show whether this one falls"
 # Part of a note if motion and given velocity are inconsistent; the checklist searches for it.
+UNDER_LOAD = "the record starts under load"
 CONTRADICTED = "but the striker's velocity is given as"
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from foamfit.data.measurement import INTEGRATED, Measurement
+from foamfit.data.noise import lowest_mean
 from foamfit.springs.parameters import NUISANCE
 
 CONTACT_TIME, TIME_SHIFT = "contact_time", "time_shift"
@@ -44,6 +45,7 @@ ALIKE = 1.5
 LARGEST_STRAIN = 0.999  # of the measured motion, with its zero taken off
 _NEAR = 12  # the speed at contact is that over this part of the way to the turn
 _OUTSIDE = 0.1  # of that part: a contact outside the record is far from it
+_FIRST = 3  # rows that show the stress at which a record begins
 _LOW = 0.1  # fraction of the peak stress below which a contact may have been overlooked
 
 
@@ -131,6 +133,18 @@ def shown_by(measurement: Measurement, drive: str, *, late: bool = False) -> dic
     if drive == "impact":
         out[CONTACT_TIME] = Prior(CONTACT_TIME, contact, error)
     return out
+
+
+def open_zero(measurement: Measurement, *, glued: bool) -> float:
+    """Return the error of the zero of the stress in a slow test that begins in contact, Pa.
+
+    Its first stress may be an offset of the sensor, and so may a tension, unless it is `glued`.
+    """
+    stress = measurement.stress
+    if stress is None or measurement.contact != "file" or "stress" in measurement.zeros:
+        return 0.0
+    tension = 0.0 if glued else -lowest_mean(stress, int(np.argmax(stress)))[0]
+    return max(float(stress[:_FIRST].mean()), tension, 0.0)
 
 
 def _motion_at(measurement: Measurement, contact: float) -> tuple[float, float, float]:

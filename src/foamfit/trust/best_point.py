@@ -22,7 +22,7 @@ from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import is_velocity
 from foamfit.fitting.branches import silent, unreached
 from foamfit.fitting.links import RATES, factor
-from foamfit.fitting.nuisance import CONTACT_TIME
+from foamfit.fitting.nuisance import CONTACT_TIME, open_zero
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together
@@ -158,7 +158,8 @@ class BestPoint:
     def shifts(self) -> Array:
         """Change of the residual by one standard error of each held parameter, (n_data, q).
 
-        A zero of the motion that is its value at the contact is off together with the contact.
+        A zero of the motion that is its value at the contact is off together with the contact. The
+        zero of a driven test's stress counts as held where no rows before contact show it.
         """
         kept, zero = self.problem.kept, "displacement_zero"
         slopes = self.problem.slopes(self.values, tuple(kept)).T
@@ -166,6 +167,10 @@ class BestPoint:
         at_rest = any(prior.name == zero for prior in self.problem.objective.priors)
         if {zero, CONTACT_TIME} <= out.keys() and not at_rest:
             out[zero] = out[zero] + out.pop(CONTACT_TIME)
+        objective, force = self.problem.objective, "stress_zero"
+        if objective.driven and not {force} & {*out, *self.names}:
+            error = open_zero(self.problem.measurement, glued=bool(objective.glued))
+            out[force] = error * self.problem.slopes(self.values, (force,))[:, 0]
         return np.reshape([*out.values()], (-1, self.residual.size)).T
 
     def gradient(self, places: NDArray[np.intp], step: Array) -> Array:

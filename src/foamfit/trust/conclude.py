@@ -15,6 +15,7 @@ from foamfit.data.calibration import contradictions
 from foamfit.data.cycles import inner_loops
 from foamfit.data.energy import audit, noise_sentences
 from foamfit.data.measurement import INTEGRATED, interior_channel
+from foamfit.data.zeros import UNDER_LOAD
 from foamfit.errors import SimulationError
 from foamfit.fitting.branches import visited
 from foamfit.fitting.curves import MOTION_CURVES
@@ -227,11 +228,13 @@ def _inner_loops(best: BestPoint) -> dict[str, Any] | None:
 
 def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict[str, Any]:
     """Return what makes all determined parameters weak, for the sentence of `why.weak`."""
+    test, model = best.problem.measurement, best.problem.model
     objective, errs = best.problem.objective, bool(best.names) and best.misfits
     misfit, curve = max((objective.off(best.simulated, n) or 0.0, n) for n in objective.counted)
     return {
         "stopped": not intervals.ranged,
         "vibrates": objective.interior_mass,
+        "begun": model.relaxation and any(UNDER_LOAD in note for note in test.notes),
         "lost": lost_height(best) if errs else 0.0,
         "alone": errs and record.stopped is None and 0 < record.agreeing < 2,
         "off": misfit if misfit > POOR else 0.0,
