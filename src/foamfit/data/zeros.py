@@ -37,7 +37,8 @@ _DRIFTS = 0.005  # share of its range by which a stress that drifts changes at l
 _MATTERS = 0.01  # relative gain of velocity in a fall above which gravity must be specified
 # Part of a note if nothing says whether the striker falls; `with_gravity` searches for it.
 UNKNOWN_FALL = "does not show whether this one falls"
-# Part of a note if motion and given velocity are inconsistent; the checklist searches for it.
+# Parts of notes that others search for: motion and given velocity are inconsistent; what relaxed
+# before the first row is unknown.
 UNDER_LOAD = "the record starts under load"
 CONTRADICTED = "but the striker's velocity is given as"
 
