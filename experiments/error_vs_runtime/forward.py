@@ -6,42 +6,53 @@ table and a figure per scene and summary.csv go to `forward/`.
 
     python experiments/error_vs_runtime/forward.py                      # all: about 5 minutes
     python experiments/error_vs_runtime/forward.py one_spring_impact    # some scenes, no page
+    python experiments/error_vs_runtime/forward.py --scaling            # prints ns by size
 """
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # processor time of one thread
-
-import gc
 import sys
 import textwrap
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from timeit import timeit
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from threadpoolctl import threadpool_limits
 
 import foamfit as ff
-import rivals
-from rivals import HEYOKA, KERNEL, PUBLIC, SCIPY, Scene
+from foamfit.solve.plan import plan
+from foamfit.springs.chain import Drive
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
+import with_scipy
+from independent import follow
 from studies import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
 
 HERE = Path(__file__).parent
+Array = np.ndarray
+Answer = tuple[Array, Array]  # displacement of the top (m) and base stress (Pa), (n,) each
+
+SAMPLES, LENGTH = 501, 0.8e-3
+MASS = 7e-3
+MODEL_2, MODEL_3 = ff.published["foam-1/model-2"], ff.published["foam-1/model-3"]
+HEIGHT, AREA = MODEL_2.chain.height, MODEL_2.chain.area
+
+PUBLIC, KERNEL, SCIPY, HEYOKA = "foamfit simulate", "foamfit kernel", "SciPy", "heyoka"
 WANTED = 2e-6  # the error at which solvers are compared
 ROUNDS = 40
 SHORTEST = 2e-3  # s; shorter runs are timed in groups
 BRIEF = 1e-2  # s; shorter runs are preceded by an untimed run
 SLOW = 1.0  # s; longer runs are made once
 FLOOR = 1e-16  # a zero error is drawn here
+SIZES = [*((count, SAMPLES) for count in (1, 10, 100, 1000)), *((1, 10**k) for k in range(2, 6))]
 TIMES = ["median (s)", "lower quartile (s)", "upper quartile (s)"]
 # Markers also distinguish solvers, besides colours.
 SOLVERS: dict[str, dict[str, Any]] = {
@@ -54,13 +65,170 @@ SOLVERS: dict[str, dict[str, Any]] = {
 }
 
 
+# ---------------------------------------------------------------- scenes and solvers
+
+
+def powers(first: int, last: int) -> tuple[float, ...]:
+    return tuple(10.0**-k for k in range(first, last))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A chain under a drive, and the settings of each solver.
+
+    `own` and `outside` are tolerances of foamfit and of SciPy; without the latter SciPy is left
+    out. No setting is tried after one that takes `longest` (s).
+    """
+
+    name: str
+    title: str
+    chain: ff.Chain
+    drive: Drive
+    time: Array
+    own: Sequence[float] = powers(2, 13)
+    outside: Sequence[float] = powers(3, 13)
+    longest: float = 0.3
+
+
+def graded(count: int, mass: float = 0.0, eta: float = 0.0) -> ff.Chain:
+    """Return springs of foam-1/model-2 with k0, k_c, Δσ, k_h±, ε_a, ε_c varied by ±10 %, shuffled.
+
+    No two of them switch at the same stress. `mass` (kg) is divided among the nodes between them.
+    """
+    rng = np.random.default_rng(count)
+    steps = 0.1 * (2.0 * (np.arange(count) + 0.5) / count - 1.0)
+    base = MODEL_2.bistable
+    springs = [
+        ff.BistableSpring(
+            base.k0 * f, base.kc * f, base.dsigma * f, base.eps_a * g, base.eps_c * g,
+            base.kh_plus * f, base.kh_minus * f, eta,
+        )
+        for f, g in zip(1 + rng.permutation(steps), 1 + rng.permutation(steps), strict=True)
+    ]  # fmt: skip
+    masses = [mass / max(count - 1, 1)] * (count - 1) + [0.0]
+    return ff.Chain(springs, [HEIGHT / count] * count, AREA, masses)
+
+
+def scenes() -> list[Scene]:
+    """Return all scenes, small ones first."""
+    t = np.linspace(0.0, LENGTH, SAMPLES)
+    one, two = ff.Chain([MODEL_2.bistable], [HEIGHT], AREA), MODEL_3.chain
+    return [
+        Scene("one_spring_impact", "one spring, impact at 2.0 m/s", one, ff.Impact(MASS, 2.0), t),
+        Scene(
+            "two_springs_mass_impact",
+            "two springs with the specimen's mass between, onsite damper, impact at 2.3 m/s", two,
+            ff.Impact(MASS, 2.3), t, outside=powers(3, 12), longest=1.0,
+        ),
+        Scene(
+            "10_springs_mass_impact",
+            "10 springs with dashpots of 2 Pa·s and 9 masses between, impact at 2.2 m/s",
+            graded(10, MODEL_2.specimen_mass, 2.0), ff.Impact(MASS, 2.2), t,
+            outside=powers(5, 11), longest=0.6,
+        ),
+        Scene(
+            "1000_springs_impact", "1000 springs, impact at 2.2 m/s", graded(1000),
+            ff.Impact(MASS, 2.2), t, own=(1e-6, 1e-10), outside=(), longest=4.0,
+        ),
+        *_with_memory(),
+    ]  # fmt: skip
+
+
+def _with_memory() -> list[Scene]:
+    """Return scenes of a microscale spring like shoe foam; two of three with relaxation."""
+    law = (5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77)
+    height, area = 25e-3, 1.6e-3
+    plain = ff.MicroscaleSpring(*law)
+    slow = ff.MicroscaleSpring(*law, relaxation=[(0.5, 0.2)])
+    quick = ff.MicroscaleSpring(*law, relaxation=[(0.5, 0.01)])
+    struck = np.linspace(0.0, 0.08, SAMPLES)
+    pressed = np.linspace(0.0, 2.0, 1280)
+    motion = 0.6 * height * np.sin(np.pi * pressed) ** 2 * np.where(pressed < 1.0, 1.0, 0.8)
+    base = ff.LinearSpring(5e6)
+    return [
+        Scene(
+            "microscale_impact", "one microscale spring, impact at 1.5 m/s",
+            ff.Chain([plain], [height], area), ff.Impact(2.0, 1.5), struck,
+        ),
+        Scene(
+            "microscale_relaxation_displacement",
+            "one microscale spring with a relaxation term, displacement drive of two cycles",
+            ff.Chain([slow], [height], area), ff.DisplacementDrive(motion), pressed, outside=(),
+        ),
+        Scene(
+            "linear_microscale_relaxation_impact",
+            "a microscale spring with a relaxation term on a linear one, impact at 1.5 m/s",
+            ff.Chain([base, quick], [0.2 * height, 0.8 * height], area), ff.Impact(2.0, 1.5),
+            struck,
+        ),
+    ]  # fmt: skip
+
+
+def solvers(scene: Scene) -> dict[str, dict[float, Callable[[], Answer]]]:
+    """Return all solvers of a scene, and the runs of each by tolerance.
+
+    They are `simulate` and the bare `Plan.run` that a fit calls, SciPy's integrators, and for an
+    impact on one bistable spring heyoka, if it is installed.
+    """
+    given = scene.chain, scene.drive, scene.time
+
+    def public(rtol: float) -> Answer:
+        response = ff.simulate(*given, rtol)
+        return response.displacement[-1], response.base_stress
+
+    runs = {name: {rtol: partial(run, rtol) for rtol in scene.own}
+            for name, run in ((PUBLIC, public), (KERNEL, kernel(*given)))}  # fmt: skip
+    if scene.outside:
+        impact = with_scipy.Impact(*given)
+        for method in with_scipy.METHODS:
+            own = {rtol: partial(impact.run, method, rtol) for rtol in scene.outside}
+            runs[f"{SCIPY} {method}"] = own
+    if scene.name == "one_spring_impact" and find_spec("heyoka"):
+        import with_heyoka
+
+        tolerances = (*scene.own, 1e-15)
+        runs[HEYOKA] = {tol: with_heyoka.Impact(*given, tol).run for tol in tolerances}
+    return runs
+
+
+def kernel(chain: ff.Chain, drive: Drive, time: Array) -> Callable[..., Answer]:
+    """Return the bare simulation that a fit calls, as a function of rtol."""
+    made, (rows, heights, *_) = plan(chain, drive, time), chain.arrays
+
+    def run(rtol: float = 1e-6) -> Answer:
+        motion = made.run(rows, heights, rtol, everything=False)
+        return motion.displacement[-1], motion.base_stress
+
+    return run
+
+
+def reference(scene: Scene) -> Answer:
+    """Return the result of the judge of the stability study, some 14 digits."""
+    most = 10_000_000 * len(scene.chain.springs)
+    truth = follow(scene.chain, scene.drive, scene.time, most=most)
+    assert not truth.why
+    return truth.displacement[-1], truth.base_stress
+
+
+def error_of(answer: Answer, truth: Answer) -> float:
+    """Return the largest error over range of top displacement and base stress."""
+    worst = 0.0
+    for got, want in zip(answer, truth, strict=True):
+        miss = np.abs(got - want).max() / np.ptp(want)
+        worst = max(worst, float(miss) if np.isfinite(miss) else np.inf)
+    return worst
+
+
+# ---------------------------------------------------------------- times
+
+
 @dataclass
 class Timed:
     """A solver at one tolerance with its error, an approximate time, and its measured times."""
 
     solver: str
     tolerance: float
-    run: Callable[[], rivals.Answer]
+    run: Callable[[], Answer]
     error: float
     first: float
     times: list[float] = field(default_factory=list)
@@ -85,23 +253,20 @@ class Timed:
 
 def seconds(run: Callable[[], object], times: int = 1) -> float:
     """Return the processor time of a run, s."""
-    began = time.process_time_ns()
-    for _ in range(times):
-        run()
-    return 1e-9 * (time.process_time_ns() - began) / times
+    return timeit(run, timer=time.process_time, number=times) / times
 
 
 def measure(scene: Scene, budget: float) -> pd.DataFrame:
     """Return error and time of every solver in a scene at every tolerance."""
-    truth, timed = rivals.reference(scene), list[Timed]()
-    for solver, runs in rivals.solvers(scene).items():
+    truth, timed = reference(scene), list[Timed]()
+    for solver, runs in solvers(scene).items():
         for tolerance, run in runs.items():
             try:
                 answer = run()  # compiles
                 first = seconds(run)
             except (RuntimeError, ff.SimulationError):  # unstable, or past a pole
                 continue
-            error = rivals.error(answer, truth)
+            error = error_of(answer, truth)
             if error < 1.0:
                 timed.append(Timed(solver, tolerance, run, error, first))
             if first > scene.longest:
@@ -117,13 +282,10 @@ def take_turns(timed: list[Timed], budget: float) -> None:
         min(max(round(share / (one.first * one.at_once)), 3), ROUNDS) if one.first < SLOW else 0
         for one in timed
     ]
-    gc.collect()
-    gc.disable()
     for turn in range(ROUNDS):
         for one, count in zip(timed, turns, strict=True):
             if (turn + 1) * count // ROUNDS > turn * count // ROUNDS:
                 one.measure()
-    gc.enable()
 
 
 # ---------------------------------------------------------------- figures and tables
@@ -154,6 +316,27 @@ def draw_scene(table: pd.DataFrame, title: str, path: Path) -> None:
         figure.legend(loc="outside right center")
 
 
+def scaling() -> pd.DataFrame:
+    """Return the kernel's time per sample and spring, ns, for many springs or many samples."""
+    spring, rows = MODEL_2.bistable, list[dict[str, Any]]()
+    for count, samples in SIZES:
+        time, half = np.linspace(0.0, LENGTH, samples), np.linspace(0.0, 1.0, samples) < 0.5
+        wave = np.sin(np.pi * np.linspace(0.0, 1.0, samples))
+        loop = np.where(half, wave**2, wave**4)  # past C1 and back
+        drives = {
+            "stress": ff.StressDrive(1.15 * spring.sigma_hat_c * loop),
+            "displacement": ff.DisplacementDrive(1.05 * spring.eps_hat_c * HEIGHT * loop),
+            "impact": ff.Impact(MASS, 2.2),
+        }
+        rows.append({"springs": count, "samples": samples})
+        for name, drive in drives.items():
+            run = kernel(graded(count), drive, time)
+            run()
+            took = np.median([seconds(run) for _ in range(3 if count == 1000 else 20)])
+            rows[-1][name] = 1e9 * float(took) / (count * samples)
+    return pd.DataFrame(rows)
+
+
 def compare(scene: Scene, table: pd.DataFrame) -> dict[str, object]:
     """Return one row of the summary: the fastest setting of each solver with an error < WANTED."""
     reached, row = table[table["error"] < WANTED], dict[str, object](scene=scene.title)
@@ -170,10 +353,14 @@ def main() -> None:
     """Measure and draw the scenes; write the page if all were asked for."""
     parser = studies.arguments(__doc__, HERE, budget=(6.0, "seconds of turns a scene"))
     parser.add_argument("scenes", nargs="*", help="names; left out = all, and the page")
+    parser.add_argument("--scaling", action="store_true", help="time by springs and samples alone")
     options = parser.parse_args()
-    folder, wanted = options.out / "forward", rivals.scenes()
-    if options.scenes:
-        wanted = [scene for scene in wanted if scene.name in options.scenes]
+    threadpool_limits(1)  # processor time of one thread
+    if options.scaling:
+        print(studies.shown(scaling()))
+        return
+    folder, wanted = options.out / "forward", scenes()
+    wanted = [scene for scene in wanted if scene.name in (options.scenes or [scene.name])]
     folder.mkdir(parents=True, exist_ok=True)
     rows, figures = [], []
     for scene in wanted:

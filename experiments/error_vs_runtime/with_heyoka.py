@@ -7,14 +7,11 @@ an optional dependency of this study alone: `pip install heyoka`.
 from __future__ import annotations
 
 import math
-import sys
-from pathlib import Path
 from typing import Any
 
 import heyoka as hy
 import numpy as np
 
-sys.path.append(str(Path(__file__).parents[1] / "stability"))
 import independent as law
 from independent import Array
 

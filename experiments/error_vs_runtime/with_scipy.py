@@ -8,9 +8,7 @@ solver's dense output.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,19 +16,8 @@ from numba import njit
 from scipy.integrate import DOP853, LSODA, Radau
 from scipy.optimize import brentq
 
-sys.path.append(str(Path(__file__).parents[1] / "stability"))
-from independent import (
-    HELD,
-    K0,
-    Array,
-    Flags,
-    System,
-    enter_branches,
-    fill_rates,
-    overshoot,
-    record_samples,
-    system_of,
-)
+import independent as judge
+from independent import Array, Flags, System
 
 METHODS = {"DOP853": DOP853, "LSODA": LSODA, "Radau": Radau}
 TINY = 4 * np.finfo(float).eps
@@ -51,7 +38,7 @@ def equations(system: System) -> Callable[[Array, np.ndarray, Array, Array], Arr
     def rates(y: Array, branch: np.ndarray, ranks: Array, most: Array) -> Array:
         out, stress, work = np.empty(y.size), np.empty(ends.size), np.empty((4, branch.size))
         own = System(springs, relax, ends, mass, drag, top, speed, gravity, work[0], work)
-        if not fill_rates(y, out, stress, Flags(branch, ranks, most), own, 0.0, 0.0):
+        if not judge.fill_rates(y, out, stress, Flags(branch, ranks, most), own, 0.0, 0.0):
             out[:] = math.nan
         return out
 
@@ -68,8 +55,8 @@ def passed(states: Array, flags: Flags, system: System, peak: float) -> tuple[in
     paces, largest = np.ones(flags.branch.size), 0.0
     for j in range(states.shape[1]):
         y = states[:, j].copy()
-        fill_rates(y, rates, stress, flags, system, 0.0, 0.0)
-        past = overshoot(y, rates, paces, flags, system, stress[0], peak)
+        judge.fill_rates(y, rates, stress, flags, system, 0.0, 0.0)
+        past = judge.overshoot(y, rates, paces, flags, system, stress[0], peak)
         if past > 0.0:
             return j, past, largest
         largest = max(largest, stress[0])
@@ -81,8 +68,8 @@ def enter(y: Array, flags: Flags, system: System) -> None:
     """Change the branch of each spring that has left its branch or reversed."""
     rates, stress, moving = np.empty(y.size), np.empty(system.ends.size), system.ends.size
     for _ in range(4):
-        fill_rates(y, rates, stress, flags, system, 0.0, 0.0)
-        if not enter_branches(y, rates, moving, flags, system.springs):
+        judge.fill_rates(y, rates, stress, flags, system, 0.0, 0.0)
+        if not judge.enter_branches(y, rates, moving, flags, system.springs):
             break
 
 
@@ -94,8 +81,8 @@ def write(
     rates, stress, now = np.empty(states.shape[0]), np.empty(system.ends.size), np.zeros(1)
     for j in range(states.shape[1]):
         y = states[:, j].copy()
-        fill_rates(y, rates, stress, flags, system, 0.0, 0.0)
-        record_samples(
+        judge.fill_rates(y, rates, stress, flags, system, 0.0, 0.0)
+        judge.record_samples(
             y, system.ends.size, flags, system.springs, now, 0.0, 0, stress[0],
             nodes[:, done + j :], base[done + j :],
         )  # fmt: skip
@@ -105,14 +92,15 @@ class Impact:
     """An impact for SciPy: its equations, and state, branches and samples of the last run."""
 
     def __init__(self, chain: Any, drive: Any, time: Array) -> None:
-        self.time, (self.system, self.kinds) = time, system_of(chain, drive, time)
+        self.time, (self.system, self.kinds) = time, judge.system_of(chain, drive, time)
         self.rates, nodes = equations(self.system), self.system.ends.size
         self.first = np.zeros(nodes + self.kinds.size + self.system.relax[:, :, 0].size)
         self.first[nodes - 1] = self.system.speed
-        stiff = self.system.springs[:, K0]
+        stiff = self.system.springs[:, judge.K0]
         self.scale = np.full(self.first.size, stiff.max())  # of relaxing stresses
         self.scale[:nodes] = self.system.speed
-        strains = np.where(self.kinds < HELD, 1.0, stiff)  # a microscale spring moves by its stress
+        by_strain = self.kinds < judge.HELD  # a microscale spring moves by its stress
+        strains = np.where(by_strain, 1.0, stiff)
         self.scale[nodes : nodes + self.kinds.size] = strains
 
     def run(self, method: str, rtol: float) -> tuple[Array, Array]:
@@ -153,7 +141,7 @@ class Impact:
                 low = times[first - 1] if first > 0 else solver.t_old
                 return self._switch(dense, states, low, times[first])
             self._keep(states, last)
-            if largest > 10.0 * rtol * self.system.springs[0, K0]:
+            if largest > 10.0 * rtol * self.system.springs[0, judge.K0]:
                 self.peak = max(self.peak, largest)
         return now, True
 
