@@ -14,11 +14,13 @@ import os
 import platform
 import re
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -76,6 +78,19 @@ def in_order(
         return
     with ProcessPoolExecutor(processes) as pool:
         yield from (task.result() for task in [pool.submit(work, *job) for job in jobs])
+
+
+def timed(work: Callable[..., Any], *given: Any, **options: Any) -> tuple[Any, float]:
+    """Return the result of a call and its processor time, s (the machine may be shared)."""
+    began = time.process_time()
+    return work(*given, **options), time.process_time() - began
+
+
+@contextmanager
+def workplace() -> Iterator[Path]:
+    """Yield a temporary folder."""
+    with TemporaryDirectory() as place:
+        yield Path(place)
 
 
 def said(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
@@ -216,17 +231,9 @@ def write_study(
     Parameters are those of the first spring unless they have a prefix. A mapping among the settings
     becomes a separate table.
     """
+    import tomli_w  # with the extras "page" and "test"
 
-    def quoted(value: Any) -> str:
-        return str(value) if isinstance(value, int | float) else f'"{value}"'
-
-    tables = {name: one for name, one in settings.items() if isinstance(one, Mapping)}
-    plain = {"model": model} | {k: v for k, v in settings.items() if k not in tables}
-    text = [f"tests = [{', '.join(quoted(test) for test in tests)}]"]
-    text += [f"{name} = {quoted(value)}" for name, value in plain.items()]
-    named = (name if re.match(r"s\d+_|site_", name) else f"s1_{name}" for name in kinds)
-    tables["parameters"] = dict(zip(named, kinds.values(), strict=True))
-    for name, table in tables.items():
-        text += ["", f"[{name}]", *(f"{key} = {quoted(value)}" for key, value in table.items())]
-    path.write_text("\n".join(text) + "\n", encoding="utf-8")
+    plain = {"tests": list(map(str, tests)), "model": model} | settings
+    own = {n if re.match(r"s\d+_|site_", n) else f"s1_{n}": kind for n, kind in kinds.items()}
+    path.write_text(tomli_w.dumps(plain | {"parameters": own}), encoding="utf-8")
     return path
