@@ -105,7 +105,7 @@ def pressed(values: dict[str, float], top: float) -> tuple[list[float], list[flo
     strains, stresses, relaxing, peak = [0.0], [0.0], 0.0, 0.0
     for leg in range(6):
         ups = leg % 2 == 0
-        goal = top * (1.0 + 0.02 * (leg // 2)) if ups else 0.0
+        goal = top * (1.0 + 0.02 * (leg // 2))
         rate = (goal - strains[-1]) / STEPS if ups else -top / STEPS
         for _ in range(STEPS):
             before = row.stress

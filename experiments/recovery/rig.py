@@ -18,6 +18,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from scipy.integrate import quad
 from scipy.signal import lfilter
 from scipy.special import ndtri
@@ -125,14 +126,10 @@ def draw_bistable(rng: np.random.Generator) -> Bistable:
     eps_c, drop = eps_a + rng.uniform(0.1, 0.45), rng.uniform(0.05, 0.8)
     sigma_a = k0 * eps_a / (1.0 - eps_a)
     return Bistable(
-        k0=k0,
-        kc=k0 * 10 ** rng.uniform(0.7, 1.7),
-        dsigma=-drop * sigma_a,
-        eps_a=eps_a,
-        eps_c=eps_c,
-        kh_plus=k0 * rng.uniform(0.1, 3.0),
+        k0=k0, kc=k0 * 10 ** rng.uniform(0.7, 1.7), dsigma=-drop * sigma_a, eps_a=eps_a,
+        eps_c=eps_c, kh_plus=k0 * rng.uniform(0.1, 3.0),
         kh_minus=sigma_a * (1.0 - drop) / eps_c * rng.uniform(0.5, 1.1),
-    )
+    )  # fmt: skip
 
 
 def draw_microscale(rng: np.random.Generator) -> tuple[Microscale, float]:
@@ -143,14 +140,10 @@ def draw_microscale(rng: np.random.Generator) -> tuple[Microscale, float]:
         least = max(0.0, (math.sqrt(kc) - math.sqrt(k0)) / (math.sqrt(kc) + math.sqrt(k0)))
         plus, spread = k0 * rng.uniform(0.1, 0.5), rng.uniform(0.15, 0.6)
         spring = Microscale(
-            k0=k0,
-            kc=kc,
-            eps_star=least + rng.uniform(0.02, 0.3),
-            sigma_plus=plus,
-            spread_plus=spread,
-            sigma_minus=plus * rng.uniform(0.3, 0.8),
+            k0=k0, kc=kc, eps_star=least + rng.uniform(0.02, 0.3), sigma_plus=plus,
+            spread_plus=spread, sigma_minus=plus * rng.uniform(0.3, 0.8),
             spread_minus=rng.uniform(0.3, 0.9),
-        )
+        )  # fmt: skip
         most = plus * math.exp(spread * float(ndtri(rng.uniform(0.7, 0.98))))
         if spring.strain(most) < 0.85:
             return spring, most
@@ -226,12 +219,9 @@ def impact(setup: Impact, seed: int) -> Record:
 
 
 def recorded(
-    setup: Impact,
-    course: Course,
-    seed: int,
-    ranges: dict[str, float] | None = None,
+    setup: Impact, course: Course, seed: int, ranges: dict[str, float] | None = None,
     step: float | None = None,
-) -> Record:
+) -> Record:  # fmt: skip
     """Return the record of the course of an impact.
 
     The noise is relative to `ranges` (SI, by default those of this test); `step` is the sampling
@@ -271,8 +261,8 @@ def recorded(
     zero = round(zeros[0] * rig.height, 7) if setup.zero and not setup.trimmed else 0.0
     shifts = {"displacement": zero}
     if setup.sensor and not setup.trimmed:
-        shifts |= {"force": zeros[1] * ranges.get("force", 0.0)}
-        shifts |= {"acceleration": zeros[2] * ranges.get("acceleration", 0.0)}
+        sensors = zip(("force", "acceleration"), zeros[1:], strict=True)
+        shifts |= {name: share * ranges.get(name, 0.0) for name, share in sensors}
     clean = {name: values + shifts.get(name, 0.0) for name, values in clean.items()}
     channels, sizes = noisy(clean, ranges, setup.noise, setup.tau, seed)
     sd = setup.velocity_sd
@@ -304,8 +294,7 @@ def slow_motion(setup: Slow, peak: float, rng: np.random.Generator) -> Motion:
     levels = [*up, *([peak] if setup.motion == "trapezoid" else []), *down[1:]]
     ways = np.abs(np.diff(levels))
     ways[ways == 0.0] = 0.05 * ways.sum()
-    shape = "cosine" if setup.motion == "sine" else "line"
-    shapes = [shape] * len(ways)
+    shapes = ["cosine" if setup.motion == "sine" else "line"] * len(ways)
     if setup.motion == "ramp":
         shapes[0] = "ramp"
     times = np.append(0.0, np.cumsum(ways)) * DURATION / ways.sum()
@@ -316,10 +305,9 @@ def drawn_slow(setup: Slow, rng: np.random.Generator) -> Course:
     """Draw springs and a motion that closes their loops; simulate."""
     kinds = setup.law.split("+")
     while True:
-        springs = list[Law]()
         if kinds[0] == "microscale":
             spring, most = draw_microscale(rng)
-            springs.append(spring)
+            springs: list[Law] = [spring]
         else:
             springs = [draw_bistable(rng) for _ in kinds]
             tops = sorted(spring.onset for spring in springs)
@@ -360,14 +348,11 @@ def slow(setup: Slow, seed: int) -> Record:
 def write_table(path: Path, record: Record, channels: Sequence[str]) -> None:
     """Write the time and some channels of a record as CSV."""
     unit, factor = ("ms", 1e3) if isinstance(record.setup, Impact) else ("s", 1.0)
-    columns = [[f"{t * factor:.12g}" for t in record.time]]
-    header = [f"time ({unit})"]
+    table = {f"time ({unit})": [f"{t * factor:.12g}" for t in record.time]}
     for channel in channels:
         unit, factor = UNITS[channel]
-        header.append(f"{channel} ({unit})")
-        columns.append([f"{v * factor:.9g}" for v in record.channels[channel]])
-    rows = [",".join(row) for row in zip(*columns, strict=True)]
-    path.write_text("\n".join([",".join(header), *rows]) + "\n", encoding="utf-8")
+        table[f"{channel} ({unit})"] = [f"{v * factor:.9g}" for v in record.channels[channel]]
+    pd.DataFrame(table).to_csv(path, index=False, lineterminator="\n")
 
 
 def write(record: Record, folder: Path, name: str = "test") -> Path:

@@ -7,17 +7,16 @@ by brute force to 13 digits (`stability/independent.py`).
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-sys.path.append(str(Path(__file__).parents[1] / "stability"))
 from independent import HAT_A, HAT_C, SIG_A, SIG_C, STAR, Truth, bistable_row, follow
 
 Array = NDArray[np.float64]
@@ -164,11 +163,11 @@ class Rig:
 
         Times before the contact are admissible for a striker.
         """
-        if self.motion is None:
-            truth = follow(self, self, time)
-        else:
-            drive = _Driven(self.motion.at(time) - self.motion.at(time[:1])[0])
-            truth = follow(self, drive, time)
+        drive: Any = self
+        if self.motion is not None:
+            moved = self.motion.at(time)
+            drive = SimpleNamespace(displacement=moved - moved[0])
+        truth = follow(self, drive, time)
         if truth.why:
             raise RuntimeError(truth.why)
         return truth
@@ -180,10 +179,10 @@ class Rig:
             return Course(self, start, truth.contact_end or last)
         time, stress = self.pressed(start, last)
         lost = np.flatnonzero((stress[1:] <= 0.0) & (stress[:-1] > 0.0))
-        if not lost.size:
-            return Course(self, start, last)
-        two = slice(lost[0], lost[0] + 2)
-        return Course(self, start, float(np.interp(0.0, stress[two][::-1], time[two][::-1])))
+        if lost.size:
+            two = slice(lost[0], lost[0] + 2)
+            last = float(np.interp(0.0, stress[two][::-1], time[two][::-1]))
+        return Course(self, start, last)
 
     def pressed(self, start: float, last: float, more: Array = NONE) -> tuple[Array, Array]:
         """Return times of a motion, at most `CLOSE` from the turns and `more` times, and stresses.
@@ -197,11 +196,6 @@ class Rig:
 
 
 @dataclass(frozen=True)
-class _Driven:
-    displacement: Array
-
-
-@dataclass(frozen=True)
 class Course:
     """Response of a rig from contact to the end of contact (s)."""
 
@@ -212,11 +206,10 @@ class Course:
     def stress(self, time: Array) -> Array:
         """Return the stress at the base, zero outside contact."""
         inside = (time >= self.start) & (time <= self.end)
-        out = np.zeros(time.size)
         if self.rig.motion is None:
-            return np.where(inside, self.rig.follow(time).base_stress, out)
-        out[inside] = np.interp(time[inside], *self.rig.pressed(self.start, self.end, time[inside]))
-        return out
+            return np.where(inside, self.rig.follow(time).base_stress, 0.0)
+        known = self.rig.pressed(self.start, self.end, time[inside])
+        return np.where(inside, np.interp(time, *known), 0.0)
 
     def top(self, time: Array, gauge: bool) -> Array:
         """Return the displacement of striker or gauge, zero at contact."""
