@@ -12,7 +12,7 @@ Eng. 16, 161.
 import numpy as np
 
 import foamfit as ff
-from ogden import CURVE, curve, is_curve, read_curve
+from ogden import CURVE, curve, is_curve, read_half
 
 
 def admissible(p):
@@ -43,12 +43,9 @@ def switch(p, x, strain, branch, up):
 
 def read_off(loop, marks, scales, way):
     """Read the elastic curve midway; half the width of the loop is k·limit."""
-    half = 0.5 * scales.strain
-    width = loop.at(half, loading=True) - loop.at(half, loading=False)
+    elastic, width = read_half(loop, marks, scales)
     limit = scales.strain * 10.0 ** (1.5 * marks[2] - 2.0)
-    k = max(0.5 * width, 0.01 * scales.stress) / limit
-    elastic = read_curve(loop, marks, scales, 0.5)
-    return np.array([*elastic, k, limit, 0.7 * 3.0 ** marks[3], 0.0])
+    return np.array([*elastic, width / limit, limit, 0.7 * 3.0 ** marks[3], 0.0])
 
 
 LAW = ff.Law(

@@ -54,11 +54,9 @@ def read_off(loop, marks, scales, way):
     """Read the curve below the middle of the loop; the overstress is half the loop width."""
     order = 0.05 * 12.0 ** marks[2]
     g = 0.5 * 4.0 ** (marks[3] - 0.5) * scales.duration**order
-    curve_of = read_curve(loop, marks, scales, 0.5)
+    mu, alpha, nu, beta = read_curve(loop, marks, scales, 0.5)
     share = 1.0 / (1.0 + 0.5 * marks[4])
-    return np.array(
-        [share * curve_of[0], curve_of[1], share * curve_of[2], curve_of[3], g, order, 0.0]
-    )
+    return np.array([share * mu, alpha, share * nu, beta, g, order, 0.0])
 
 
 LAW = ff.Law(

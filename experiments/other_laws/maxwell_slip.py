@@ -16,7 +16,7 @@ from numba import njit
 
 import foamfit as ff
 from bouc_wen_foam import admissible, ends
-from ogden import CURVE, curve, read_curve
+from ogden import CURVE, curve, read_half
 
 N = 24  # sliders; their elastic strains at the last turn, and the strain there, are internal
 
@@ -49,12 +49,9 @@ def switch(p, x, strain, branch, up):
 
 def read_off(loop, marks, scales, way):
     """Read the elastic curve midway; half the loop width is the stress of all sliders."""
-    half = 0.5 * scales.strain
-    width = loop.at(half, loading=True) - loop.at(half, loading=False)
+    elastic, width = read_half(loop, marks, scales)
     slip, spread = scales.strain * 10.0 ** (1.2 * marks[2] - 1.2), 0.5 * 8.0 ** marks[3]
-    k = max(0.5 * width, 0.01 * scales.stress) / slip * (1.0 + spread)
-    elastic = read_curve(loop, marks, scales, 0.5)
-    return np.array([*elastic, k, slip, spread, 0.0])
+    return np.array([*elastic, width / slip * (1.0 + spread), slip, spread, 0.0])
 
 
 LAW = ff.Law(

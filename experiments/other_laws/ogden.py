@@ -82,6 +82,13 @@ def read_curve(loop, marks, scales, share):
     return [max(mu, 2e-3 * scales.slope), alpha, max(nu, 2e-6 * scales.slope), beta]
 
 
+def read_half(loop, marks, scales):
+    """Read the curve midway, and half the width of the loop at half the strain (not zero)."""
+    half = 0.5 * scales.strain
+    width = loop.at(half, loading=True) - loop.at(half, loading=False)
+    return read_curve(loop, marks, scales, 0.5), max(0.5 * width, 0.01 * scales.stress)
+
+
 def is_curve(p):
     """Return whether the first four parameters are admissible."""
     return p[:3].min() > 0.0 and p[3] >= -3.0

@@ -10,8 +10,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
-import tempfile
-import time
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,15 +41,11 @@ class Compared(NamedTuple):
     more: dict[str, Any] = {}  # further options of the fit  # noqa: RUF012
 
 
+WORN = "microscale, stiffening, softening, weakening, relaxation"
 LAWS = (
     Compared("microscale", "microscale"),
     Compared("microscale, relaxation", "microscale", 1),
-    Compared(
-        "microscale, stiffening, softening, weakening, relaxation",
-        "microscale",
-        1,
-        more={"stiffening": True, "mullins": True},
-    ),
+    Compared(WORN, "microscale", 1, more={"stiffening": True, "mullins": True}),
     Compared("bistable", "bistable"),
     Compared("bistable, relaxation", "bistable", 1),
     Compared("bistable, power-law damper", "bistable-power-damper", 0, "power_law_damper"),
@@ -91,14 +85,10 @@ def read(name: str, folder: Path) -> ff.Measurement:
 
 def thinned(test: ff.Measurement, path: Path) -> ff.Measurement:
     """Keep every n-th row of a test, at most `ROWS`, as a test without a striker."""
-    some = slice(None, None, -(-test.time.size // ROWS))
-    own = test.specimen
+    step, own = -(-test.time.size // ROWS), test.specimen
     toml = f'name = "{test.name}"\n[specimen]\nheight = "{own.height} m"\narea = "{own.area} m^2"\n'
-    studies.write_test(
-        path, toml, time=test.time[some], stress=test.stress[some],
-        displacement=test.displacement[some],
-    )  # fmt: skip
-    return ff.read_test(path)
+    columns = {name: getattr(test, name)[::step] for name in ("time", "stress", "displacement")}
+    return ff.read_test(studies.write_test(path, toml, **columns))
 
 
 # ------------------------------------------------------------------------------- the fits
@@ -106,18 +96,16 @@ def thinned(test: ff.Measurement, path: Path) -> ff.Measurement:
 
 def fit_all(case: tuple[str, str, str], starts: int) -> list[dict[str, Any]]:
     """Fit one test by every law and predict the unseen test; return rows with curves."""
-    rows = []
-    with tempfile.TemporaryDirectory() as temporary:
-        folder, (group, name, other) = Path(temporary), case
+    rows, (group, name, other) = [], case
+    with studies.workplace() as folder:
         test, held_out = (read(one, folder) for one in (name, other))
         for law in LAWS:
             if law.file and not laws.is_registered(law.model):
                 ff.register(importlib.import_module(law.file).LAW)
             options: dict[str, Any] = law.more | {"relaxation": law.relaxation}
             ff.fit(test, model=law.model, starts=1, max_time=0.2, intervals="local", **options)
-            began = time.process_time()  # after compilation
-            result = ff.fit(test, model=law.model, drive="displacement", starts=starts, **options)
-            seconds = time.process_time() - began
+            options |= {"model": law.model, "drive": "displacement", "starts": starts}
+            result, seconds = studies.timed(ff.fit, test, **options)  # after compilation
             states = [p.state for n, p in result.parameters.items() if p.vary and n not in NUISANCE]
             strain, curves = result.strain, result.curves
             rows.append({
@@ -215,9 +203,8 @@ def fit_tests(given: argparse.Namespace) -> None:
     studies.measurements(
         "shoe-foam", "shoe-foam-twins", "mycelium-rates", "lattice-cycles", "cartilage-impact"
     )
-    cases = [case for case in TESTS if given.only in case[1]]
     rows = list[dict[str, Any]]()
-    jobs = [(case, given.starts) for case in cases]
+    jobs = [(case, given.starts) for case in TESTS if given.only in case[1]]
     for more in studies.in_order(fit_all, jobs, given.jobs):
         rows += more  # an interrupted study keeps its rows
         table = pd.DataFrame(rows).drop(columns="curves")
