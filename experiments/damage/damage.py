@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import sys
-import tempfile
 from pathlib import Path
 
 import matplotlib
@@ -31,11 +30,6 @@ SHARES = ("start_strain", "misfit_stress_strain")
 LATTICE_CYCLES = (1, 2, 10, 100, 1000)
 
 
-def is_pressure(column: str) -> bool:
-    """Return whether a column is shown in kPa or kJ/m³."""
-    return column.removeprefix("s1_").startswith(("k", "sigma", "dissipated"))
-
-
 # ------------------------------------------------------------------------------- the twins
 
 
@@ -44,37 +38,34 @@ def fit_twins(folder: Path) -> pd.DataFrame:
     rows = []
     for name in records.HEELS:
         found = ff.fit_cycles(records.place(name, folder), intervals="local", **MODEL)
-        rows.append(found.by_cycle.reset_index().assign(specimen=name))
+        rows.append(by_cycle(name, found))
         print(name, len(found.results), "cycles", file=sys.stderr)
-    return specimen_first(rows)
+    return pd.concat(rows, ignore_index=True)
 
 
-def specimen_first(tables: list[pd.DataFrame]) -> pd.DataFrame:
-    """Concatenate the tables of specimens, with the name of the specimen first."""
-    table = pd.concat(tables, ignore_index=True)
-    return table[["specimen", *table.columns.drop("specimen")]]
-
-
-def kind(table: pd.DataFrame, name: str) -> pd.DataFrame:
-    return table[table["specimen"].str.startswith(name)]
+def by_cycle(name: str, found: ff.CycleFits) -> pd.DataFrame:
+    """Return the table of a specimen, with its name first."""
+    table = found.by_cycle.reset_index()
+    table.insert(0, "specimen", name)
+    return table
 
 
 def twin_table(table: pd.DataFrame) -> str:
     """Return mean and standard deviation by cycle, new and worn; how often it is determined."""
     rows = []
-    for name in ("new", "worn"):
-        for cycle, group in kind(table, name).groupby("cycle"):
-            if len(group) < 5:
-                continue
-            shown = [name, str(cycle)]
-            for column in SHOWN:
-                m, s = group[column].mean(), group[column].std()
-                unit = 1e3 if is_pressure(column) else 1.0
-                text = f"{significant(m / unit, 3)} ± {significant(s / unit, 2)}"
-                if column in NAMES:
-                    text += f" ({(group[f'{column}_state'] == 'determined').sum()})"
-                shown.append(f"{100 * m:.2f} ± {100 * s:.2f} %" if column in SHARES else text)
-            rows.append(shown)
+    for (name, cycle), group in table.groupby([table["specimen"].str.split("-").str[0], "cycle"]):
+        if len(group) < 5:
+            continue
+        shown = [name, str(cycle)]
+        for column in SHOWN:
+            m, s = group[column].mean(), group[column].std()
+            pressure = column.removeprefix("s1_").startswith(("k", "sigma", "dissipated"))
+            unit = 1e3 if pressure else 1.0  # kPa or kJ/m³
+            text = f"{significant(m / unit, 3)} ± {significant(s / unit, 2)}"
+            if column in NAMES:
+                text += f" ({(group[f'{column}_state'] == 'determined').sum()})"
+            shown.append(f"{100 * m:.2f} ± {100 * s:.2f} %" if column in SHARES else text)
+        rows.append(shown)
     head = ["", "cycle", "start strain", "dissipated (kJ/m³)", "misfit", *(n[3:] for n in NAMES)]
     return studies.markdown(head, rows) + "\n\nStiffnesses and stresses in kPa, tau1 in s."
 
@@ -117,8 +108,8 @@ def fit_lattices(folder: Path) -> tuple[pd.DataFrame, dict[str, ff.CycleFits]]:
         )
         for name in records.LATTICES
     }
-    tables = [one.by_cycle.reset_index().assign(specimen=name) for name, one in found.items()]
-    return specimen_first(tables), found
+    tables = [by_cycle(name, one) for name, one in found.items()]
+    return pd.concat(tables, ignore_index=True), found
 
 
 def lattice_table(table: pd.DataFrame) -> str:
@@ -159,9 +150,9 @@ def draw_lattices(found: dict[str, ff.CycleFits]) -> None:
 def main() -> None:
     studies.arguments(__doc__).parse_args()
     studies.measurements("shoe-foam-twins", "lattice-cycles")
-    with tempfile.TemporaryDirectory() as folder:
-        lattices, found = fit_lattices(Path(folder))
-        twins = fit_twins(Path(folder))
+    with studies.workplace() as folder:
+        lattices, found = fit_lattices(folder)
+        twins = fit_twins(folder)
     studies.write_csv(twins, HERE / "twins.csv", 6)
     studies.write_csv(lattices, HERE / "lattice.csv", 6)
     draw_lattices(found)

@@ -9,8 +9,6 @@ parameters.csv (every parameter of every fit), ways_back.csv and memory.png.
 from __future__ import annotations
 
 import sys
-import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -90,39 +88,32 @@ def turned_back_table(table: pd.DataFrame) -> str:
     return studies.markdown("folder | records | loadings, unloadings | most taken back", rows)
 
 
-def fitted(test: ff.Measurement, **more: Any) -> tuple[Fit, float]:
-    began = time.process_time()  # the machine may be shared
-    return ff.fit(test, **MEMORY, **more), time.process_time() - began
-
-
 def study() -> None:
     """Fit and predict; both tables are written row by row."""
     rows, values = list[dict[str, Any]](), list[dict[str, Any]]()
 
     def add(test: str, what: str, more: list[dict[str, Any]], result: Fit) -> None:
-        rows.extend({"test": test, "what": what, **row} for row in more)
+        about = {"test": test, "what": what}
+        rows.extend(about | row for row in more)
         values.extend(
-            {
-                "test": test, "what": what, "parameter": name, "value": p.value,
-                "stderr": p.stderr, "unit": p.unit, "state": p.state,
-            }
+            about | {"parameter": name, "value": p.value, "stderr": p.stderr, "unit": p.unit,
+                     "state": p.state}
             for name, p in (varied(result) if what != PREDICTED else {}).items()
         )  # fmt: skip
         studies.write_csv(rows, TABLE)
         studies.write_csv(values, PARAMETERS)
         print(test, what, *(f"{100.0 * row['misfit']:.2f} %" for row in more), flush=True)
 
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
+    with studies.workplace() as folder:
         for test in records.first_cycles(folder):
-            result, seconds = fitted(test, relaxation=1)
+            result, seconds = studies.timed(ff.fit, test, **MEMORY, relaxation=1)
             miss = misfits(test, result)[test.cycle]
             row = {"cycle": 1, "misfit": miss, "inside": np.nan, "seconds": seconds}
             add(test.name, FIRST, [row], result)
         for name in ("turbo-comp-1 cycles", *HEELS):
             file, specimen = records.place(name, folder), name.removesuffix(" cycles")
             test = ff.read_test(file, cycles=(1, 3))
-            result, seconds = fitted(test, relaxation=2)
+            result, seconds = studies.timed(ff.fit, test, **MEMORY, relaxation=2)
             later = ff.predict(result, ff.read_test(file, cycles=(1, 5)))
             whole = {"cycle": "1-3", "misfit": result.misfit["stress_strain"], "seconds": seconds}
             each = [{"cycle": n, "misfit": m} for n, m in misfits(test, result).items()]
@@ -165,10 +156,8 @@ def summary(table: pd.DataFrame) -> str:
     """Return mean and worst misfit of each part with the goals."""
     rows = []
     for what, (mean, worst) in BARS.items():
-        own = table[table["what"] == what]
-        own = own[own["cycle"].astype(str).isin(["1-3"])] if what == HISTORY else own
-        miss = 100.0 * own["misfit"].astype(float)
-        inside = 100.0 * own["inside"].astype(float)
+        own = table[(table["what"] == what) & ((what != HISTORY) | (table["cycle"] == "1-3"))]
+        miss, inside = (100.0 * own[one].astype(float) for one in ("misfit", "inside"))
         shown = f"{inside.min():.0f}–{inside.max():.0f} %" if what == PREDICTED else "–"
         rows.append([
             what, own["test"].nunique(), f"{miss.mean():.2f} % (≤ {mean:.2f})",
@@ -181,33 +170,21 @@ def summary(table: pd.DataFrame) -> str:
 def per_specimen(table: pd.DataFrame) -> str:
     wide = table[table["what"] != FIRST].assign(cycle=table["cycle"].astype(str))
     made = wide.pivot_table(index="test", columns="cycle", values=["misfit", "inside"], sort=False)
-    misfit, inside = made["misfit"], made["inside"][["4", "5"]]
-    head = ["specimen", *(f"cycle {c}" if len(c) == 1 else "cycles 1 to 3" for c in misfit.columns)]
-    head += [f"inside {c}" for c in inside.columns]
-    cells = (
-        [test, *(f"{100.0 * x:.2f}" for x in misfit.loc[test]),
-         *(f"{100.0 * x:.1f}" for x in inside.loc[test])]
-        for test in made.index
-    )  # fmt: skip
-    return studies.markdown(head, cells)
+    misfit, inside = 100.0 * made["misfit"], 100.0 * made["inside"][["4", "5"]]
+    names = [f"cycle {c}" if len(c) == 1 else "cycles 1 to 3" for c in misfit.columns]
+    cells = misfit.map("{:.2f}".format).join(inside.map("{:.1f}".format), rsuffix=" inside")
+    head = ["specimen", *names, *(f"inside {c}" for c in inside.columns)]
+    return studies.markdown(head, cells.reset_index().to_numpy())
 
 
-def coverage(table: pd.DataFrame, *, chosen: bool | None = None) -> str:
+def coverage(predicted: pd.DataFrame) -> str:
     """Describe the share of samples of cycles 4 and 5 inside the band, for some specimens."""
-    own = table[table["what"] == PREDICTED]
-    own = own if chosen is None else own[own["test"].isin(CHOSEN) == chosen]
-    share = 100.0 * own["inside"].astype(float)
+    share = 100.0 * predicted["inside"].astype(float)
     there = int(((share >= 93.0) & (share <= 99.0)).sum())
     return (
         f"{share.mean():.1f} % of the samples on average, {share.min():.0f}–{share.max():.0f} % "
         f"per cycle, and 93–99 % in {there} of {share.size} cycles"
     )
-
-
-def seconds(table: pd.DataFrame) -> str:
-    """Describe the run time of the fits of cycles 1 to 3."""
-    own = table[table["what"] == HISTORY]["seconds"].dropna()
-    return f"{own.min():.0f} to {own.max():.0f} s, {own.mean():.0f} s on average,"
 
 
 def values_table(values: pd.DataFrame) -> str:
@@ -233,10 +210,13 @@ def main() -> None:
         studies.write_csv(turned_back(data), BACK)
         study()
     table, values = pd.read_csv(TABLE), pd.read_csv(PARAMETERS)
+    took = table[table["what"] == HISTORY]["seconds"].dropna()
     studies.write_page(
         HERE, source=SOURCE, summary=summary(table), specimens=per_specimen(table),
-        values=values_table(values), inside=coverage(table), seconds=seconds(table),
-        verified=coverage(table, chosen=False), back=turned_back_table(pd.read_csv(BACK)),
+        values=values_table(values), inside=coverage(table[table["what"] == PREDICTED]),
+        seconds=f"{took.min():.0f} to {took.max():.0f} s, {took.mean():.0f} s on average,",
+        verified=coverage(table[(table["what"] == PREDICTED) & ~table["test"].isin(CHOSEN)]),
+        back=turned_back_table(pd.read_csv(BACK)),
     )  # fmt: skip
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -83,8 +82,7 @@ def judged(seed: int, springs: int) -> list[dict[str, Any]]:
     foam, rows = draw(seed, springs), list[dict[str, Any]]()
     model = "+".join(["bistable"] * springs)
     about = {"foam": seed, "springs": springs}
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
+    with studies.workplace() as folder:
         hit = run(foam, foam["first"], foam["mass"])
         assert hit is not None
         first = recorded(Impact(), hit[0], seed)
@@ -102,13 +100,13 @@ def judged(seed: int, springs: int) -> list[dict[str, Any]]:
         for name, one in result.parameters.items():
             if name in plan.now:
                 rows.append(about | seconds | {"second": "none", **shown(name, one, None)})
+        best = advice.candidate if advice else None
         tests = {
-            "advised": None if advice is None else (advice.candidate.velocity,
-                                                    advice.candidate.mass),
+            "advised": (best.velocity, best.mass) if best else None,
             "strongest": (foam["fastest"], 2.0 * foam["mass"]),
             "random": foam["random"],
             "ideal": (1.1 * foam["closing"], foam["mass"]),
-        }  # fmt: skip
+        }
         for number, (kind, asked) in enumerate(tests.items(), start=1):
             row = about | {"second": kind}
             if asked is None:
@@ -116,8 +114,7 @@ def judged(seed: int, springs: int) -> list[dict[str, Any]]:
                 continue
             row |= {"velocity over closing": asked[0] / foam["closing"], "mass": asked[1]}
             hit = run(foam, *asked)
-            limits = hit is not None and hit[1] <= foam["force"] and hit[2] <= MOST_STRAIN
-            if hit is None or not limits:
+            if hit is None or not (hit[1] <= foam["force"] and hit[2] <= MOST_STRAIN):
                 rows.append(row | {"broke": True})
                 continue
             second = recorded(Impact(), hit[0], 1000 * number + seed, ranges, step)
@@ -186,22 +183,21 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     for springs, part in rows.groupby("springs"):
         good = part[part.state == "determined"].groupby(["foam", "second"]).parameter.agg(set)
         foams = sorted(part.foam.unique())
-        of_first = {foam: good.get((foam, "none"), set()) for foam in foams}
-
-        def after(foam: int, kind: str, good: Any = good, of_first: Any = of_first) -> set[str]:
-            return set(good.get((foam, kind), of_first[foam]))
-
-        could = {foam: set().union(*(after(foam, kind) for kind in SECOND)) for foam in foams}
+        after = {  # the second test; the first alone, if the second was not made
+            kind: {f: good.get((f, kind), good.get((f, "none"), set())) for f in foams}
+            for kind in ("none", *SECOND)
+        }
+        could = {f: set().union(*(after[kind][f] for kind in SECOND)) for f in foams}
         total = sum(map(len, could.values()))
-        for kind in ("none", *SECOND):
-            mine, own = part[part.second == kind], {foam: after(foam, kind) for foam in foams}
+        for kind, own in after.items():
+            mine = part[part.second == kind]
             sure = mine[(mine["expected width"] > 0.0) & (mine.width > 0.0)]
             ratio = sure.width / sure["expected width"]
             out.append({
                 "springs": springs, "second test": kind, "foams": len(foams),
                 "determined": sum(len(own[f] & could[f]) for f in foams), "could be": total,
                 "broke the rig": int(mine.drop_duplicates("foam").broke.eq(True).sum()),
-                "fewer than random": sum(len(own[f]) < len(after(f, "random")) for f in foams),
+                "fewer than random": sum(len(own[f]) < len(after["random"][f]) for f in foams),
                 "velocity over closing": mine["velocity over closing"].median(),
                 "width over expected": ratio.median(),
                 "within 1.5 (%)": 100.0 * float(((ratio < 1.5) & (ratio > 1 / 1.5)).mean()),

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -28,15 +27,17 @@ HEEL = "new-heel-comp-1"
 Row = dict[str, Any]
 
 
-def obtained(foam: str, name: str, what: str, found: Any) -> Row:
-    """Return the row of a fitted parameter: half its 95 % interval and half its range."""
-    one = found.parameters[name]
-    size = abs(one.value) or math.nan
-    half, open_ = (
-        math.nan if ends is None else 0.5 * (ends[1] - ends[0]) / size
-        for ends in (one.ci95, one.range)
-    )
-    return row(foam, name, what, half, open_, one.state)
+def row(foam: str, name: str, what: str, one: Any) -> Row:
+    """Return the row of a fitted or expected parameter: half its 95 % interval, half its range."""
+    if hasattr(one, "share"):  # expected
+        half, open_ = one.share, math.nan
+    else:
+        size, unknown = abs(one.value) or math.nan, (math.nan, math.nan)
+        low, high = one.ci95 or unknown
+        least, most = one.range or unknown
+        half, open_ = 0.5 * (high - low) / size, 0.5 * (most - least) / size
+    return {"foam": foam, "parameter": name, "tests": what, "95 % interval (±%)": 100.0 * half,
+            "range (±%)": 100.0 * open_, "state": one.state}  # fmt: skip
 
 
 def relaxation(folder: Path) -> Iterator[Row]:
@@ -48,13 +49,11 @@ def relaxation(folder: Path) -> Iterator[Row]:
     plan = ff.plan(first, rig=rig)
     print(plan)
     for name in ("s1_g1", "s1_tau1"):
-        yield obtained("mycelium", name, "2 s per cycle, alone", first)
+        yield row("mycelium", name, "2 s per cycle, alone", first.parameters[name])
         for one in plan.outcomes:
-            if one.candidate.hold or one.candidate.repeat:
-                continue
-            found = one.expected[name]
-            what = f"expected with a test at {one.candidate.rate:.3g} 1/s"
-            yield row("mycelium", name, what, found.share, math.nan, found.state)
+            if not (one.candidate.hold or one.candidate.repeat):
+                what = f"expected with a test at {one.candidate.rate:.3g} 1/s"
+                yield row("mycelium", name, what, one.expected[name])
     for rate in ("4s", "80s"):
         study = studies.write_study(
             folder / f"{rate}.toml", [paths["2s"].name, paths[rate].name], "microscale",
@@ -64,9 +63,9 @@ def relaxation(folder: Path) -> Iterator[Row]:
         alone = ff.fit(ff.read_test(paths[rate]), model="microscale", relaxation=1)
         test = f"test at {RATES[rate]:g} 1/s"
         for name in ("s1_g1", "s1_tau1"):
-            for what, found in ((f"obtained with a {test} (joint fit)", joint),
-                                (f"the {test} alone", alone)):  # fmt: skip
-                yield obtained("mycelium", name, what, found)
+            what = f"obtained with a {test} (joint fit)"
+            yield row("mycelium", name, what, joint.parameters[name])
+            yield row("mycelium", name, f"the {test} alone", alone.parameters[name])
 
 
 def cycles(folder: Path) -> Iterator[Row]:
@@ -82,25 +81,16 @@ def cycles(folder: Path) -> Iterator[Row]:
     five = next(one for one in plan.outcomes if one.candidate.cycles == 5)
     later = ff.fit(ff.read_test(path, cycles=(1, 5)), **law)
     for name, found in five.expected.items():
-        yield obtained("shoe foam", name, "cycle 1", first)
-        yield row(
-            "shoe foam", name, "expected with five cycles", found.share, math.nan, found.state
-        )
-        yield obtained("shoe foam", name, "obtained from cycles 1 to 5", later)
-
-
-def row(foam: str, name: str, what: str, half: float, open_: float, state: str) -> Row:
-    """Return one row of the table; shares in %."""
-    return {"foam": foam, "parameter": name, "tests": what, "95 % interval (±%)": 100.0 * half,
-            "range (±%)": 100.0 * open_, "state": state}  # fmt: skip
+        yield row("shoe foam", name, "cycle 1", first.parameters[name])
+        yield row("shoe foam", name, "expected with five cycles", found)
+        yield row("shoe foam", name, "obtained from cycles 1 to 5", later.parameters[name])
 
 
 def main() -> None:
     """Run the study."""
     out = studies.arguments(__doc__, HERE).parse_args().out
     studies.measurements("mycelium-rates", "shoe-foam-twins")
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
+    with studies.workplace() as folder:
         rows = [*relaxation(folder), *cycles(folder)]
     studies.write_csv(rows, out / "real.csv", 3)
     print(pd.DataFrame(rows).to_string(index=False))

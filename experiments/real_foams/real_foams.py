@@ -9,8 +9,6 @@ real_foams.png (one loop, two laws).
 from __future__ import annotations
 
 import sys
-import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -56,9 +54,8 @@ def rows_of(test: str, law: str, result: Fit, seconds: float) -> Iterator[dict[s
         yield {
             "test": test, "foam": test.rpartition("-comp")[0], "law": law,
             "misfit": result.misfit["stress_strain"],
-            "agreeing": result.statistics["n_agreeing"],
-            "seconds": seconds,
-            "parameter": name, "value": p.value, "stderr": p.stderr, "ci95_low": low,
+            "agreeing": result.statistics["n_agreeing"], "seconds": seconds, "parameter": name,
+            "value": p.value, "stderr": p.stderr, "ci95_low": low,
             "ci95_high": high, "unit": p.unit, "state": p.state,
         }  # fmt: skip
 
@@ -152,13 +149,12 @@ def main() -> None:
     studies.measurements("shoe-foam", "shoe-foam-twins")
     ff.fit(ff.read_test(HERE.parent / "foam-1" / "model-1-2.0mps-reconstruction.csv"))  # compiles
     rows, shown = list[dict[str, Any]](), dict[str, Fit]()
-    with tempfile.TemporaryDirectory() as folder:
-        tests = list(records.first_cycles(Path(folder)))
+    with studies.workplace() as folder:
+        tests = list(records.first_cycles(folder))
         for test in tests:
             for law, (model, relaxation, starts) in LAWS.items():
-                began = time.process_time()  # the machine may be shared
-                result = ff.fit(test, model=model, relaxation=relaxation, starts=starts)
-                seconds = time.process_time() - began
+                options = {"model": model, "relaxation": relaxation, "starts": starts}
+                result, seconds = studies.timed(ff.fit, test, **options)
                 rows += rows_of(test.name, law, result, seconds)
                 misfit = 100.0 * (result.misfit["stress_strain"] or 0.0)
                 print(f"{test.name:18}{law:24}{misfit:.2f} %  {seconds:.1f} s", flush=True)

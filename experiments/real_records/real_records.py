@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,8 +26,9 @@ import studies
 
 HERE = Path(__file__).parent
 Array = np.ndarray
-Values = dict[str, float]
+
 MODELS = {"bistable": 0, "microscale": 1}  # and the number of relaxation terms
+LAWS = {"bistable": "bistable", "microscale": "microscale, relaxation"}  # in the tables
 STARTS = 25
 SECONDS = 60.0
 
@@ -84,18 +84,17 @@ class Judge:
     def excluded(self, result: ff.FitResult, height: float) -> Iterator[str]:
         """Yield what a fit accepts although the record excludes it."""
         found = {name: item.value for name, item in result.parameters.items()}
-        if "displacement_zero" in found:
-            share = found["displacement_zero"] / self.motion
-            if abs(share) > 0.05:
-                yield f"motion zero {100.0 * share:+.0f} % of the motion"
-            if (strain := (self.highest - found["displacement_zero"]) / height) >= 1.0:
-                yield f"measured strain {strain:.2f}"
-        if "stress_zero" in found:
-            share = (found["stress_zero"] - self.rest) / self.peak
-            if abs(share) > 0.05:
-                yield f"stress zero {100.0 * share:+.0f} % of the stress"
-        if "contact_time" in found and found["contact_time"] < self.rise - 10.0 * self.step:
-            yield f"contact {(self.rise - found['contact_time']) / self.step:.0f} samples early"
+        motion, stress = found.get("displacement_zero"), found.get("stress_zero", self.rest)
+        if motion is not None and abs(motion) > 0.05 * self.motion:
+            yield f"motion zero {100.0 * motion / self.motion:+.0f} % of the motion"
+        if motion is not None and (strain := (self.highest - motion) / height) >= 1.0:
+            yield f"measured strain {strain:.2f}"
+        if abs(stress - self.rest) > 0.05 * self.peak:
+            share = (stress - self.rest) / self.peak
+            yield f"stress zero {100.0 * share:+.0f} % of the stress"
+        early = (self.rise - found.get("contact_time", self.rise)) / self.step
+        if early > 10.0:
+            yield f"contact {early:.0f} samples early"
         for name, misfit in result.misfit.items():
             if misfit is not None and not misfit <= 1.0:
                 yield f"misfit of {name} {100.0 * misfit:.0f} %"
@@ -116,7 +115,7 @@ def fits(folder: Path) -> Iterator[dict[str, object]]:
                 misfits = [f"{100.0 * m:.1f}" for m in result.misfit.values() if m is not None]
                 states = [p.state for n, p in result.parameters.items() if n.startswith("s1_")]
                 yield {
-                    "record": real.name, "law": law_of(model, terms),
+                    "record": real.name, "law": LAWS[model],
                     "drive": f"{drive or 'default'}: {result.drive}" if drive is None else drive,
                     "misfits (%)": " / ".join(misfits),
                     "determined": states.count("determined"),
@@ -125,11 +124,6 @@ def fits(folder: Path) -> Iterator[dict[str, object]]:
                     ),
                     "seconds": seconds, "excluded": "; ".join(wrong) or "nothing",
                 }  # fmt: skip
-
-
-def law_of(model: str, terms: int) -> str:
-    """Name a law in a table."""
-    return f"{model}, relaxation" if terms else model
 
 
 # ------------------------------------------------------------------------- plain least squares
@@ -168,27 +162,24 @@ def microscale(values: Array, strain: Array, instants: Array) -> Array:
 
 def plain_misfit(test: ff.Measurement, model: str, zero: float, *, starts: int = STARTS) -> float:
     """Return the misfit of plain least squares from random starts: RMS over range of the stress."""
-    assert test.stress is not None
-    assert test.displacement is not None
     strain = test.displacement / test.specimen.height - zero
     strain = np.maximum(strain, 0.0) if test.contact != "file" else strain
     instants = np.arange(strain.size, dtype=float) if test.time is None else test.time
-    outliers, sampled = test.outliers.get("stress"), test.sampled.get("stress")
-    kept = np.ones(strain.size, dtype=bool) if sampled is None else sampled.copy()
-    if outliers is not None:
-        kept &= ~outliers.left_out
+    kept = test.sampled.get("stress", np.ones(strain.size, bool))
+    if "stress" in test.outliers:
+        kept = kept & ~test.outliers["stress"].left_out
     size, most, lasts = float(test.stress.max()), float(strain.max()), float(np.ptp(instants))
     stiff, span = size / most, float(np.ptp(test.stress))
-    law: Callable[[Array, Array, Array], Array] = microscale
-    box = [(0.03, 300), (0.01, 100), (1e-3, 0.6), (0.02, 3), (0.05, 3), (0.002, 1.5), (0.05, 3)]
-    unit = [stiff, stiff, 1.0, size, 1.0, size, 1.0, 1.0, lasts]
-    box += [(0.01, 5.0), (1e-3, 1.0)]
+
     if model == "bistable":
-        law = bistable
-        box = [(0.03, 30), (0.03, 300), (1e-4, 0.999), (0.02, 0.9), (0.005, 0.8), (0.01, 30)]
-        box += [(1e-4, 30)]
-        unit = [stiff, stiff, 1.0, most, most, stiff, stiff]
-    low, high = np.log(np.array(box).T * np.array(unit))
+        law, unit = bistable, [stiff, stiff, 1.0, most, most, stiff, stiff]
+        least = (0.03, 0.03, 1e-4, 0.02, 5e-3, 0.01, 1e-4)
+        largest = (30, 300, 0.999, 0.9, 0.8, 30, 30)
+    else:
+        law, unit = microscale, [stiff, stiff, 1.0, size, 1.0, size, 1.0, 1.0, lasts]
+        least = (0.03, 0.01, 1e-3, 0.02, 0.05, 2e-3, 0.05, 0.01, 1e-3)
+        largest = (300, 100, 0.6, 3, 3, 1.5, 3, 5, 1)
+    low, high = np.log(np.array([least, largest]) * unit)
 
     def residual(point: Array) -> Array:
         try:
@@ -215,7 +206,7 @@ def compared(folder: Path) -> Iterator[dict[str, object]]:
             other = plain_misfit(test, model, moved / test.specimen.height)
             own = result.misfit["stress_strain"] or 0.0
             yield {
-                "loop": test.name, "law": law_of(model, terms), "fit (%)": 100.0 * own,
+                "loop": test.name, "law": LAWS[model], "fit (%)": 100.0 * own,
                 "plain (%)": 100.0 * other, "fit over plain": own / other,
             }  # fmt: skip
 
@@ -224,9 +215,9 @@ def main() -> None:
     """Fit all records and write tables and page."""
     args = studies.arguments(__doc__, HERE).parse_args()
     studies.measurements("cartilage-impact", "lattice-impact", "aluminium-foam", "shoe-foam")
-    with tempfile.TemporaryDirectory() as made:
-        six = studies.said(fits(Path(made)))
-        every = studies.said(compared(Path(made)))
+    with studies.workplace() as made:
+        six = studies.said(fits(made))
+        every = studies.said(compared(made))
     studies.write_csv(six, args.out / "fits.csv")
     studies.write_csv(every, args.out / "loops.csv")
     wrong, worst = six[six["excluded"] != "nothing"], every.loc[every["fit over plain"].idxmax()]

@@ -8,7 +8,6 @@ Method and answer: README.md. Also written: scatter.csv.
 from __future__ import annotations
 
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -29,21 +28,17 @@ SCATTER = dict.fromkeys((*studies.MICROSCALE, "g1", "tau1"), "scatter")
 OPEN = {"k0": "scatter", "sigma_plus": "shared"}  # the others are own
 
 
-def name_of(group: str, number: int) -> str:
-    """Return the file name of a specimen."""
-    return f"{group}-heel-comp-{number}_raw.txt"
-
-
 def predicted(
     folder: Path, group: str, fitted: list[int], left: list[int], kinds: dict[str, str]
 ) -> list[dict[str, Any]]:
     """Fit some specimens jointly and predict others; return one row for each."""
+    names = {i: f"{group}-heel-comp-{i}_raw.txt" for i in (*fitted, *left)}
     study = studies.write_study(
-        folder / "study.toml", [name_of(group, i) for i in fitted], "microscale", kinds,
+        folder / "study.toml", [names[i] for i in fitted], "microscale", kinds,
         relaxation=1, drive="displacement", name=f"{group} heel",
     )  # fmt: skip
     result, rows = ff.joint(study), []
-    every = {i: ff.read_test(folder / name_of(group, i)) for i in (*fitted, *left)}
+    every = {i: ff.read_test(folder / name) for i, name in names.items()}
     for i in left:
         found = ff.predict(result, every[i])
         one = found.curves["stress_strain"]
@@ -99,10 +94,7 @@ def main() -> None:
     studies.arguments(__doc__).parse_args()
     studies.measurements("shoe-foam-twins")
     rows, numbers = [], list(range(1, COUNT + 1))
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        for name in records.HEELS:
-            records.place(name, folder)
+    with records.placed(*records.HEELS) as folder:
         for group in GROUPS:
             for left in numbers:
                 others = [i for i in numbers if i != left]

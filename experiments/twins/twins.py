@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,9 +51,9 @@ Loops = Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]]
 
 def measure(folder: Path) -> None:
     """Fit each group jointly in each cycle; write wear.csv."""
-    frames = [wear(fit_together(folder, n), loops(folder, n)).assign(cycle=n) for n in CYCLES]
-    rows = pd.concat(frames)
-    studies.write_csv(rows[["cycle", *rows.columns.drop("cycle")]], HERE / "wear.csv")
+    frames = {n: wear(fit_together(folder, n), loops(folder, n)) for n in CYCLES}
+    rows = pd.concat(frames, names=["cycle", "row"]).reset_index("cycle")
+    studies.write_csv(rows, HERE / "wear.csv")
 
 
 def fit_together(folder: Path, cycle: int) -> dict[str, dict[str, Any]]:
@@ -99,11 +98,6 @@ def mean_loop(group: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarra
     return np.mean(strains, axis=0), np.mean(stresses, axis=0), np.std(stresses, axis=0, ddof=1)
 
 
-def lost(loop: tuple[np.ndarray, np.ndarray]) -> float:
-    """Return the energy dissipated by a loop, J/m³."""
-    return float(np.trapezoid(loop[1], loop[0]))
-
-
 # ------------------------------------------------------------------------------- comparison
 
 
@@ -131,9 +125,9 @@ class Group(NamedTuple):
     def row(self, name: str) -> dict[str, float]:
         """Return the common (median) value, its 95 % interval (Student's t) and the spread."""
         half = float(stats.t.ppf(0.975, self.count - 1)) * self.stderr
-        low, high = math.exp(self.mean - half), math.exp(self.mean + half)
-        ends = {f"{name}_lo": low, f"{name}_hi": high}
-        return {name: math.exp(self.mean), **ends, f"{name}_spread": self.spread}
+        logs = {"": self.mean, "_lo": self.mean - half, "_hi": self.mean + half}
+        ends = {f"{name}{end}": math.exp(log) for end, log in logs.items()}
+        return ends | {f"{name}_spread": self.spread}
 
 
 def change_of(quantity: str, new: Group, worn: Group) -> dict[str, Any]:
@@ -161,9 +155,13 @@ def counted_together(changes: pd.DataFrame) -> pd.DataFrame:
 
 def wear(found: Mapping[str, Mapping[str, Any]], measured: Loops) -> pd.DataFrame:
     """Compare the joint fits of two groups, and their measured loops."""
+    measures = {  # of the strain and stress of a loop
+        ENERGY: lambda strain, stress: float(np.trapezoid(stress, strain)),
+        PEAK: lambda strain, stress: float(stress.max()),
+    }
     rows = [
-        change_of(name, *(Group.of([one(loop) for loop in measured[g]]) for g in GROUPS))
-        for name, one in ((ENERGY, lost), (PEAK, lambda loop: float(loop[1].max())))
+        change_of(name, *(Group.of([one(*loop) for loop in measured[g]]) for g in GROUPS))
+        for name, one in measures.items()
     ]
     for name in SCATTERING:
         new, worn = (Group.of_joint(found[group]["parameters"][name]) for group in GROUPS)
@@ -176,9 +174,8 @@ def wear(found: Mapping[str, Mapping[str, Any]], measured: Loops) -> pd.DataFram
 
 def shown_change(one: Any) -> str:
     """Return a change with its 95 % interval as text."""
-    ends = (one.change, one.change_lo, one.change_hi)
-    value, low, high = (f"{100 * end:+.0f}".replace("-", "−") for end in ends)
-    return f"{value} % ({low} to {high} %)"
+    ends = 100.0 * one.change, 100.0 * one.change_lo, 100.0 * one.change_hi
+    return "{:+.0f} % ({:+.0f} to {:+.0f} %)".format(*ends).replace("-", "−")
 
 
 def verdict(one: Any) -> str:
@@ -202,16 +199,11 @@ def draw(changes: pd.DataFrame, measured: Loops, path: Path) -> None:
         left.legend(loc="upper left")
         order = list(changes[changes["cycle"] == FIRST]["quantity"])[::-1]
         for cycle, off, colour in ((FIRST, 0.12, studies.BLACK), (LATER, -0.12, GREY)):
-            own = (
-                100.0
-                * changes[changes["cycle"] == cycle]
-                .set_index("quantity")
-                .loc[order, ["change", "change_lo", "change_hi"]]
-            )
-            ends = [own["change"] - own["change_lo"], own["change_hi"] - own["change"]]
+            own = changes[changes["cycle"] == cycle].set_index("quantity").loc[order]
+            value, low, high = (100.0 * own[f"change{end}"] for end in ("", "_lo", "_hi"))
             right.errorbar(
-                own["change"], np.arange(len(order)) + off, xerr=ends, fmt="o", color=colour,
-                markersize=3.5, linewidth=0.9, label=f"cycle {cycle}",
+                value, np.arange(len(order)) + off, xerr=[value - low, high - value], fmt="o",
+                color=colour, markersize=3.5, linewidth=0.9, label=f"cycle {cycle}",
             )  # fmt: skip
         right.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
         right.set_yticks(range(len(order)), [name.removeprefix("s1_") for name in order])
@@ -258,10 +250,7 @@ def main() -> None:
     parser.add_argument("--page", action="store_true", help="only write picture and page")
     options = parser.parse_args()
     studies.measurements("shoe-foam-twins")
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        for name in records.HEELS:
-            records.place(name, folder)
+    with records.placed(*records.HEELS) as folder:
         if not options.page:
             measure(folder)
         write(loops(folder, FIRST))

@@ -5,21 +5,15 @@ Method and answer: README.md.
     FOAMFIT_DATA=… python experiments/whole_fits/whole_fits.py       # 5 minutes
 """
 
-# ruff: noqa: E402  (the number of threads is read when NumPy is imported)
-
 from __future__ import annotations
 
-import os
-
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_name] = "1"
-
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+from threadpoolctl import threadpool_limits
 
 import foamfit as ff
 
@@ -77,10 +71,10 @@ def rows(found: dict[str, ff.Measurement]) -> Iterator[dict[str, object]]:
 def main() -> None:
     """Fit all records and write the table."""
     args = studies.arguments(__doc__, HERE).parse_args()
+    threadpool_limits(1)
     studies.measurements("cartilage-impact", "aluminium-foam", "shoe-foam")
-    with tempfile.TemporaryDirectory() as made:
-        names = {name for name, _ in FITS}
-        found = {name: ff.read_test(records.place(name, Path(made))) for name in names}
+    with studies.workplace() as folder:
+        found = {name: ff.read_test(records.place(name, folder)) for name, _ in FITS}
         table = studies.said(rows(found))
         seconds, misfit = plain(found["turbo-comp-2"])
     studies.write_page(
