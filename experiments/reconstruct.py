@@ -75,29 +75,23 @@ def write(item: PublishedSet, velocity: float, place: Path = HERE) -> Path:
     """Write the CSV and the TOML of one reconstruction to a subfolder of `place`."""
     rng = np.random.default_rng([SEED, round(1000 * velocity), *item.name.encode()])
     time, stress, displacement = simulate(item, velocity)
-    contact = stress > 0
-    noise = (NOISE * np.ptp(stress), NOISE * np.ptp(displacement[contact]))
+    noise = (NOISE * np.ptp(stress), NOISE * np.ptp(displacement[stress > 0]))
     force = (stress + noise[0] * rng.standard_normal(time.size)) * item.chain.area
     motion = displacement + noise[1] * rng.standard_normal(time.size)
-    folder, _, model = item.name.partition("/")
-    path = (
-        place / folder / f"{'-'.join(filter(None, (model, f'{velocity}mps')))}-reconstruction.csv"
-    )
+    folder, slash, model = item.name.partition("/")
+    path = place / folder / f"{model}{slash and '-'}{velocity}mps-reconstruction.csv"
     path.parent.mkdir(parents=True, exist_ok=True)
     facts = {"set": item.name, "velocity": velocity, "noise": NOISE, "seed": SEED}
-    rows = zip(1e3 * (time - time[0]), force, 1e3 * motion, strict=True)
-    body = "".join(f"{t:.6f},{f:.4f},{w:.6f}\n" for t, f, w in rows)
-    path.write_text(TABLE.format(**facts) + body)
+    columns = np.column_stack([1e3 * (time - time[0]), force, 1e3 * motion])
+    head = TABLE.format(**facts).rstrip()
+    np.savetxt(path, columns, ["%.6f", "%.4f", "%.6f"], ",", header=head, comments="")
     heights = item.chain.heights
     listed = ", ".join(f'"{1e3 * h:g} mm"' for h in heights)
     toml = TOML.format(
-        **facts,
-        height=1e3 * item.chain.height,
-        mass=1e6 * item.specimen_mass,
+        **facts, height=1e3 * item.chain.height, mass=1e6 * item.specimen_mass,
         heights=f"heights = [{listed}]    # base first\n" if len(heights) > 1 else "",
-        stress=1e-3 * noise[0],
-        displacement=1e6 * noise[1],
-    )
+        stress=1e-3 * noise[0], displacement=1e6 * noise[1],
+    )  # fmt: skip
     path.with_suffix(".toml").write_text(toml)
     return path
 

@@ -13,7 +13,6 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -93,12 +92,10 @@ def measure_speedup(place: Path, *words: str) -> dict[str, Any]:
         took[jobs] = watched(place, "--jobs", jobs, "--out", out.name, *words)
         values[jobs] = [file.read_bytes() for file in sorted(out.glob("*/parameters.csv"))]
     return {
-        "tests": TESTS,
-        "one": took[1],
-        "two": took[2],
+        "tests": TESTS, "one": took[1], "two": took[2],
         "share of ideal (clock)": took[1]["wall_s"] / (2.0 * took[2]["wall_s"]),
         "same numbers": values[1] == values[2] and len(values[1]) == TESTS,
-    }
+    }  # fmt: skip
 
 
 def task(path: Path, toml: Path, recipe: Recipe, out: Path) -> Task:
@@ -126,11 +123,8 @@ def measure_overhead(place: Path) -> dict[str, Any]:
                 fits[0], began = 0.0, time.process_time()
             work(task(path, place / "foam.toml", recipe, place / "out" / path.stem))
         spent = time.process_time() - began
-    return {
-        "tests": count,
-        "fit_ms": 1e3 * fits[0] / count,
-        "beside_ms": 1e3 * (spent - fits[0]) / count,
-    }
+    each, beside = 1e3 * fits[0] / count, 1e3 * (spent - fits[0]) / count
+    return {"tests": count, "fit_ms": each, "beside_ms": beside}
 
 
 def measure_memory(place: Path) -> dict[str, Any]:
@@ -166,12 +160,8 @@ def measure_parts(place: Path) -> dict[str, Any]:
         for path in paths:
             fingerprint(recipe, path, toml)
             stored(first.out, first.fingerprint, recipe)
-        again = time.process_time() - began
-        found[name] = {
-            "files": len(files),
-            "kB": sum(files) / 1e3,
-            "again_ms": 1e3 * again / len(paths),
-        }
+        again = 1e3 * (time.process_time() - began) / len(paths)
+        found[name] = {"files": len(files), "kB": sum(files) / 1e3, "again_ms": again}
     return found
 
 
@@ -190,8 +180,8 @@ def main() -> None:
     kept = HERE / "batch.json"
     found = json.loads(kept.read_text())
     for name in parser.parse_args().measures or MEASURES:
-        with tempfile.TemporaryDirectory() as place:
-            found[name] = MEASURES[name](Path(place)) | {"load": os.getloadavg()[1]}
+        with studies.workplace() as place:
+            found[name] = MEASURES[name](place) | {"load": os.getloadavg()[1]}
         print(name, json.dumps(found[name], indent=1), flush=True)
         kept.write_text(json.dumps(found, indent=1) + "\n")
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -102,14 +101,10 @@ def simulations() -> Iterator[Row]:
         }
         for drive, driven in drives.items():
             found = ff.simulate(chain, driven, time)
-            for mark, value in {
-                "peak": found.base_stress.max(),
-                "mean": found.base_stress.mean(),
-                "strain": found.strain.max(),
-                "end": found.contact_end,
-            }.items():
-                if value is not None:
-                    yield f"simulation {name}, {drive}", mark, repr(float(value))
+            stress, end = found.base_stress, found.contact_end
+            marks = {"peak": stress.max(), "mean": stress.mean(), "strain": found.strain.max()}
+            for mark, value in (marks if end is None else marks | {"end": end}).items():
+                yield f"simulation {name}, {drive}", mark, repr(float(value))
 
 
 def together(folder: Path) -> Iterator[Row]:
@@ -167,14 +162,13 @@ def main() -> int:
     parser = studies.arguments(__doc__)
     parser.add_argument("--renew", action="store_true")
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as place:
-        rows = [*simulations(), *fits(Path(place)), *together(Path(place))]
+    with studies.workplace() as folder:
+        rows = [*simulations(), *fits(folder), *together(folder)]
     if options.renew:
         pd.DataFrame(rows, columns=["result", "quantity", "value"]).to_csv(FILE, index=False)
         return 0
     kept = pd.read_csv(FILE, dtype=str, keep_default_na=False).itertuples(index=False)
-    before = {(name, what): value for name, what, value in kept}
-    now = {(name, what): value for name, what, value in rows}
+    before, now = ({(name, what): value for name, what, value in all_} for all_ in (kept, rows))
     differences = changed(before, now)
     print("\n".join(differences) or f"All {len(now)} numbers are unchanged.")
     return 1 if differences else 0

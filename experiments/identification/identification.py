@@ -8,19 +8,12 @@ foam is omitted.
     python experiments/identification/identification.py --redraw          # figures and page only
 """
 
-# ruff: noqa: E402  (the number of threads is read when NumPy is imported)
-
 from __future__ import annotations
-
-import os
-
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_name] = "1"  # one thread for all, so that processor time is elapsed time
 
 import argparse
 import json
+import os
 import sys
-import tempfile
 import time
 import warnings
 from collections.abc import Callable
@@ -37,6 +30,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 import foamfit as ff
 from foamfit.fitting.box import Space
@@ -100,8 +94,8 @@ class Case:
     def problem(self) -> Problem:
         """Read the test and set up the problem, as `foamfit.fit` does."""
         if self.by_others:
-            with tempfile.TemporaryDirectory() as folder:
-                test = ff.read_test(records.place(self.record, Path(folder)))
+            with studies.workplace() as folder:
+                test = ff.read_test(records.place(self.record, folder))
         else:
             test = ff.read_test(HERE.parent / self.record)
         return make_problem(test, self.model, self.drive, None, None, False)
@@ -177,13 +171,16 @@ def recorded(
     return [*rows, (min(time.process_time() - began, budget), lowest)]
 
 
+def fitted(case: Case, problem: Problem, **options: Any) -> ff.FitResult:
+    """Fit a problem by foamfit's search."""
+    options |= {"model": case.model, "drive": case.drive, "intervals": "local"}
+    return ff.fit(problem.measurement, **options)
+
+
 def run_own(case: Case, problem: Problem, seed: int) -> None:
     """Fit repeatedly by foamfit's search, each time with another seed."""
     for again in range(1000):
-        ff.fit(
-            problem.measurement, model=case.model, drive=case.drive, seed=1000 * seed + again,
-            intervals="local",
-        )  # fmt: skip
+        fitted(case, problem, seed=1000 * seed + again)
 
 
 @dataclass(frozen=True)
@@ -228,16 +225,15 @@ class Variables:
         return np.asarray(slopes @ (np.transpose(columns) / (2.0 * step)))
 
     def _vector(self, params: lmfit.Parameters) -> Array:
-        if self.coordinates == "box":
-            return self.space.decode(_values(params))
-        return self.problem.vector(params)
+        box = self.coordinates == "box"
+        return self.space.decode(_values(params)) if box else self.problem.vector(params)
 
     def _free(self, values: Array) -> Array:
         return values[[self.problem.index[name] for name in self.problem.free()]]
 
 
 def _values(params: lmfit.Parameters) -> Array:
-    return np.array([parameter.value for parameter in params.values()])
+    return np.array(list(params.valuesdict().values()))
 
 
 def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int) -> None:
@@ -281,11 +277,8 @@ def best_known(case: Case, problem: Problem) -> float:
     """Return the lowest cost of three long searches, which also compile everything."""
     costs = []
     for seed in range(9000, 9003):
-        result = ff.fit(
-            problem.measurement, model=case.model, drive=case.drive, seed=seed, starts=96,
-            intervals="local",
-        )  # fmt: skip
-        residual = problem.objective.residual(result.problem.vector())  # without the file's zeros
+        found = fitted(case, problem, seed=seed, starts=96).problem
+        residual = problem.objective.residual(found.vector())  # without the file's zeros
         costs.append(float(residual @ residual))
     return min(costs)
 
@@ -346,9 +339,8 @@ def draw_curves(
             row[len(GROUPS) // 2].set_title(CASES[key].title)
         for axes, title in zip(grid[-1], GROUPS, strict=True):
             axes.set_xlabel(f"processor time (s): {title}")
-        heading = (
-            f"{COORDINATES[coordinates]}: median and quartiles of {runs['seed'].nunique()} seeds"
-        )
+        seeds = runs["seed"].nunique()
+        heading = f"{COORDINATES[coordinates]}: median and quartiles of {seeds} seeds"
         figure.suptitle(heading, fontsize=8)
         handles = [Line2D([], [], label=name, **_line(name)) for name in STYLES]
         figure.legend(handles=handles, loc="outside lower center", ncols=5, handlelength=3.2)
@@ -395,6 +387,7 @@ def main() -> None:
     parser.add_argument("--problems", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--redraw", action="store_true", help="draw what was recorded")
     options = parser.parse_args()
+    threadpool_limits(1)  # for all, so that processor time is elapsed time
     log, notes = options.out / "runs.csv.gz", options.out / "runs.json"
     if not options.redraw:
         runs, setup = run_all(options)

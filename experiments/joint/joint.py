@@ -10,8 +10,7 @@ Method and answer: README.md. The foam is a microscale spring under a slow trian
 from __future__ import annotations
 
 import sys
-import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +70,9 @@ def four(draws: int, folder: Path) -> Iterator[Row]:
     yield {"study": "four", "what": "stderr of four tests over one's", "draws": draws, "mean": mean}
 
 
-def holds(interval: tuple[float, float], truth: float) -> bool:
-    return bool(interval[0] <= truth <= interval[1])
+def held(intervals: Iterable[tuple[float, float]], truth: float) -> dict[str, float]:
+    """Return the share of intervals that contain the true value, with its 95 % interval."""
+    return studies.share([bool(low <= truth <= high) for low, high in intervals])
 
 
 def scatter(draws: int, folder: Path, spread: float) -> Iterator[Row]:
@@ -85,11 +85,9 @@ def scatter(draws: int, folder: Path, spread: float) -> Iterator[Row]:
             write_test(folder / f"t{i}.csv", 0.1, rng, k0=own)
         found.append(ff.joint(write_study(folder, kinds)).parameters["s1_k0"])
     row: Row = {"study": f"scatter {spread:g}", "draws": draws}
-    common = studies.share([holds(one.ci95, SPRING["k0"]) for one in found])
-    yield row | {"what": "common value"} | common
+    yield row | {"what": "common value"} | held((one.ci95 for one in found), SPRING["k0"])
     mean = float(np.mean([one.scatter for one in found]))
-    held = studies.share([holds(one.scatter_ci95, spread) for one in found])
-    yield row | {"what": "spread", "mean": mean} | held
+    yield row | {"what": "spread", "mean": mean} | held((one.scatter_ci95 for one in found), spread)
 
 
 def rates(draws: int, folder: Path, kind: str, slope: float) -> Iterator[Row]:
@@ -104,14 +102,12 @@ def rates(draws: int, folder: Path, kind: str, slope: float) -> Iterator[Row]:
         result = ff.joint(write_study(folder, SHARED | {"sigma_plus": kind}))
         found.append(result.parameters["s1_sigma_plus"])
         chosen.append(min(result.evidence, key=lambda alternative: alternative.bic).kind)
-    for what, off, held in (
-        ("value", [(one.value - truth) / one.stderr for one in found],
-         [holds(one.ci95, truth) for one in found]),
-        ("slope b", [(one.b - slope) / one.b_stderr for one in found],
-         [holds(one.b_ci95, slope) for one in found]),
-    ):  # fmt: skip
+    values = [(one.value, one.stderr, one.ci95) for one in found]
+    slopes = [(one.b, one.b_stderr, one.b_ci95) for one in found]
+    for what, true, each in (("value", truth, values), ("slope b", slope, slopes)):
+        off = [(value - true) / error for value, error, _ in each]
         row = {"study": kind, "what": what, "draws": draws, "mean": float(np.mean(off))}
-        yield row | {"spread": float(np.std(off))} | studies.share(held)
+        yield row | {"spread": float(np.std(off))} | held((ends for *_, ends in each), true)
     for name in ("log rate", "power rate", "shared", "own"):
         yield {"study": kind, "what": f"evidence for {name}", "draws": draws,
                "share": chosen.count(name) / draws}  # fmt: skip
@@ -134,8 +130,8 @@ def main() -> None:
     rows = list[Row]()
     for name in [given.only] if given.only else STUDIES:
         maker, draws, *settings = STUDIES[name]
-        with tempfile.TemporaryDirectory() as folder:
-            rows += maker(given.draws or draws, Path(folder), *settings)
+        with studies.workplace() as folder:
+            rows += maker(given.draws or draws, folder, *settings)
     studies.write_csv(rows, given.out / "joint.csv")
     table = studies.shown(pd.DataFrame(rows))
     print(studies.write_page(HERE, given.out, table=table))

@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import replace
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
@@ -46,23 +47,17 @@ def bistable(rng: np.random.Generator, sigma_a: float, late: bool) -> ff.Bistabl
     """Draw a spring; `late`: one that densifies late, like those of the paper's chains."""
     eps_a = rng.uniform(0.15, 0.4) if late else rng.uniform(0.05, 0.35)
     eps_c = eps_a + (rng.uniform(0.25, 0.4) if late else rng.uniform(0.1, 0.45))
-    k0 = sigma_a * (1 - eps_a) / eps_a
-    drop = rng.uniform(0.1, 0.7)
+    k0, drop = sigma_a * (1 - eps_a) / eps_a, rng.uniform(0.1, 0.7)
     return ff.BistableSpring(
-        k0=k0,
-        kc=k0 * 10 ** rng.uniform(0.8, 1.6),
-        dsigma=-drop * sigma_a,
-        eps_a=eps_a,
-        eps_c=eps_c,
-        kh_plus=k0 * rng.uniform(0.3, 3),
+        k0=k0, kc=k0 * 10 ** rng.uniform(0.8, 1.6), dsigma=-drop * sigma_a, eps_a=eps_a,
+        eps_c=eps_c, kh_plus=k0 * rng.uniform(0.3, 3),
         kh_minus=sigma_a * (1 - drop) / eps_c * rng.uniform(0.5, 1.1),
-    )
+    )  # fmt: skip
 
 
 def random_chain(rng: np.random.Generator, model: str) -> tuple[list, list[float]]:
     """Draw springs and heights: a linear spring 2-8 times as stiff, or σ_a 2-4 times as high."""
-    sigma_a = 10 ** rng.uniform(5.5, 6.5)
-    share = rng.uniform(0.35, 0.65)
+    sigma_a, share = 10 ** rng.uniform(5.5, 6.5), rng.uniform(0.35, 0.65)
     heights = [HEIGHT * share, HEIGHT * (1 - share)]
     if model == "bistable":
         return [bistable(rng, sigma_a, late=False)], [HEIGHT]
@@ -75,12 +70,8 @@ def random_chain(rng: np.random.Generator, model: str) -> tuple[list, list[float
 
 def quasi_static_work(springs: list, heights: list[float], stress: float) -> float:
     """Return the quasi-static work (J) that loads a chain to a stress (Pa)."""
-    history = np.linspace(0, stress, 4000)
-    work = 0.0
-    for spring, height in zip(springs, heights, strict=True):
-        strain = spring.strain(history)
-        work += float(np.trapezoid(history, strain)) * height * AREA
-    return work
+    history, pairs = np.linspace(0, stress, 4000), zip(springs, heights, strict=True)
+    return sum(float(np.trapezoid(history, one.strain(history))) * h * AREA for one, h in pairs)
 
 
 def random_test(
@@ -132,7 +123,7 @@ def random_test(
 
 def best_simpler_misfit(clean: Measurement, model: str, damped: bool) -> float:
     """Return the least RMS misfit of the simpler models to both curves without noise."""
-    ladder, least = [(name, with_) for name in MODELS for with_ in (False, True)], np.inf
+    ladder, least = list(product(MODELS, (False, True))), np.inf
     for name, with_ in ladder[: ladder.index((model, damped))]:
         params = make_params(clean, name)
         for key in params:
@@ -147,9 +138,7 @@ def best_simpler_misfit(clean: Measurement, model: str, damped: bool) -> float:
 def climb(seed: int, kind: int, case: int) -> dict[str, Any]:
     """Draw a test of a structure and fit it; return a row of structures.csv."""
     (model, damped), rng = STRUCTURES[kind], np.random.default_rng([seed, kind, case])
-    made = None
-    while made is None:
-        made = random_test(rng, model, damped)
+    made = next(filter(None, (random_test(rng, model, damped) for _ in count())))
     clean, test, noise, dissipated, closed = made
     misfit = best_simpler_misfit(clean, model, damped)
     clear = closed and misfit >= CLEAR_MISFIT * noise

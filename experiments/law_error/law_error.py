@@ -9,7 +9,6 @@ Method and answer: README.md. Also written: law_error.csv.
 from __future__ import annotations
 
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -73,8 +72,7 @@ def impact(width: float, rate: float, samples: int = 501) -> Curves:
     """Simulate an impact on a foam with rounded kinks or a stress rise of `rate` per e-fold."""
     height, area, mass = 1.2e-3, 1.9635e-5, 7e-3
     strain, up, down = branches(width)
-    last = 1.12 * SPRING.eps_hat_c
-    inside = strain <= last
+    inside = strain <= 1.12 * SPRING.eps_hat_c
     velocity = np.sqrt(2.0 * np.trapezoid(up[inside], strain[inside]) * area * height / mass)
 
     def stress(x: float, v: float, path: np.ndarray) -> float:
@@ -90,10 +88,10 @@ def impact(width: float, rate: float, samples: int = 501) -> Curves:
         )  # fmt: skip
 
     there = run(0.0, [0.0, velocity], up, lambda t, y: y[1])
-    back = run(there.t[-1], there.y[:, -1], down, lambda t, y: stress(y[0], y[1], down))
-    clock = np.linspace(0.0, back.t[-1], samples)
-    loading = clock <= there.t[-1]
     turn = there.t[-1]
+    back = run(turn, there.y[:, -1], down, lambda t, y: stress(y[0], y[1], down))
+    clock = np.linspace(0.0, back.t[-1], samples)
+    loading = clock <= turn
     y = np.where(loading, there.sol(np.minimum(clock, turn)), back.sol(np.maximum(clock, turn)))
     force = np.where(loading, stress(y[0], y[1], up), stress(y[0], y[1], down))
     return Curves(clock, force, y[0], height, area, (mass, float(velocity)))
@@ -111,11 +109,7 @@ def curves(kind: str) -> Curves:
         course = Rig((foam,), (height,), area, motion=motion).run(0.0, 5.0)
         clock = clock[:930]
         return Curves(clock, course.stress(clock), course.top(clock, False), height, area)
-    if kind == "rounded kinks":
-        return impact(width=0.03, rate=0.0)
-    if kind == "rate effect":
-        return impact(width=1e-4, rate=0.02)
-    return impact(width=1e-4, rate=0.0)  # the fitted law itself
+    return impact(0.03 if kind == "rounded kinks" else 1e-4, 0.02 if kind == "rate effect" else 0.0)
 
 
 KINDS = {  # and the autocorrelation of the noise from sample to sample
@@ -127,13 +121,11 @@ KINDS = {  # and the autocorrelation of the noise from sample to sample
 }
 
 
-def drawn(kind: str, draw: int) -> tuple[np.ndarray, np.ndarray]:
+def drawn(kind: str, draw: int) -> np.ndarray:
     """Draw the noise of stress and displacement, over its standard deviation."""
-    rng = np.random.default_rng([draw, list(KINDS).index(kind)])
+    rng, rho = np.random.default_rng([draw, list(KINDS).index(kind)]), KINDS[kind]
     white = rng.standard_normal((2, curves(kind.split(",")[0]).time.size + 500))
-    rho = KINDS[kind]
-    stress, motion = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], white)[:, 500:]
-    return stress, motion
+    return lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], white)[:, 500:]
 
 
 def read(kind: str, draw: int | None) -> ff.Measurement:
@@ -149,14 +141,13 @@ def read(kind: str, draw: int | None) -> ff.Measurement:
     if test.striker is not None:
         toml += '[striker]\nmass = "{} kg"\nvelocity = "{} m/s"\n'.format(*test.striker)
     columns = {"time": test.time, "stress": stress, "displacement": motion}
-    with tempfile.TemporaryDirectory() as folder:
-        return ff.read_test(studies.write_test(Path(folder) / "test.csv", toml, **columns))
+    with studies.workplace() as folder:
+        return ff.read_test(studies.write_test(folder / "test.csv", toml, **columns))
 
 
 def draws_of(kind: str, draws: int) -> pd.DataFrame:
-    """Yield a row for each parameter and draw."""
-    rows = list[dict[str, Any]]()
-    without = ff.fit(read(kind, None))
+    """Return a row for each parameter and draw."""
+    rows, without = list[dict[str, Any]](), ff.fit(read(kind, None))
     for draw in range(draws):
         began = time.perf_counter()
         result = ff.fit(read(kind, draw))
@@ -198,25 +189,19 @@ def summary_of(table: pd.DataFrame) -> pd.DataFrame:
     groups = table.groupby("kind", sort=False)
     holds = 100 * groups["holds"].agg(["mean", "min", "max"])
     width = groups["width over scatter"].agg(["min", "max"])
-    return pd.DataFrame(
-        {
-            "test": list(groups.groups),
-            "draws": groups["draws"].max(),
-            "ci95 contains the best fit without noise (%)": [
-                f"{mean:.1f} ({low:.1f} to {high:.1f})" for mean, low, high in holds.to_numpy()
-            ],
-            "width of ci95 over the scatter of refits": [
-                f"{low:.2f} to {high:.2f}" for low, high in width.to_numpy()
-            ],
-            "law error detected (%)": (100 * groups["error of the law found"].mean()).round(1),
-            "median fit (s)": groups["seconds"].median().round(2),
-        }
-    )
+    return pd.DataFrame({
+        "test": list(groups.groups), "draws": groups["draws"].max(),
+        "ci95 contains the best fit without noise (%)":
+            [f"{mean:.1f} ({low:.1f} to {high:.1f})" for mean, low, high in holds.to_numpy()],
+        "width of ci95 over the scatter of refits":
+            [f"{low:.2f} to {high:.2f}" for low, high in width.to_numpy()],
+        "law error detected (%)": (100 * groups["error of the law found"].mean()).round(1),
+        "median fit (s)": groups["seconds"].median().round(2),
+    })  # fmt: skip
 
 
 def main() -> None:
-    parser = studies.arguments(__doc__, HERE, draws=200)
-    options = parser.parse_args()
+    options = studies.arguments(__doc__, HERE, draws=200).parse_args()
     table = studies.said(row for kind in KINDS for row in coverage(draws_of(kind, options.draws)))
     studies.write_csv(table, options.out / "law_error.csv")
     summary = summary_of(table)

@@ -9,10 +9,8 @@ Method and answer: README.md, which 225 draws of each class (a minute) write.
 from __future__ import annotations
 
 import sys
-import tempfile
-import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +34,7 @@ class Motion:
 
     at: Callable[[np.ndarray], np.ndarray]
     turns: np.ndarray
-    holds: tuple[tuple[float, float], ...] = ()
+    holds: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
 
 
 def straight(places: list[float], heights: list[float]) -> Motion:
@@ -44,14 +42,11 @@ def straight(places: list[float], heights: list[float]) -> Motion:
     places, heights = np.array(places), np.array(heights)
     moves = np.flatnonzero(np.diff(heights))
     up = np.sign(np.diff(heights)[moves])
-    turns = [
-        0.5 * (places[a + 1] + places[b])
-        for a, b, same in zip(moves[:-1], moves[1:], up[:-1] == up[1:], strict=True)
-        if not same
-    ]
+    back = np.flatnonzero(up[:-1] != up[1:])
+    turns = 0.5 * (places[moves[back] + 1] + places[moves[back + 1]])
     flat = np.flatnonzero(np.diff(heights) == 0.0)
-    holds = tuple((float(places[i]), float(places[i + 1])) for i in flat)
-    return Motion(lambda t: np.interp(t, places, heights), np.array(turns), holds)
+    holds = np.column_stack([places[flat], places[flat + 1]])
+    return Motion(lambda t: np.interp(t, places, heights), turns, holds)
 
 
 def smooth(function: Callable[[np.ndarray], np.ndarray]) -> Motion:
@@ -68,9 +63,8 @@ def triangle(rng: np.random.Generator) -> Motion:
 
 
 def asymmetric(rng: np.random.Generator) -> Motion:
-    return straight(
-        [0.0, rng.choice([rng.uniform(0.08, 0.4), rng.uniform(0.6, 0.92)]), 1.0], [0.0, 1.0, 0.0]
-    )
+    turn = rng.choice([rng.uniform(0.08, 0.4), rng.uniform(0.6, 0.92)])
+    return straight([0.0, turn, 1.0], [0.0, 1.0, 0.0])
 
 
 def sine(rng: np.random.Generator) -> Motion:
@@ -162,10 +156,7 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterato
     t = sampled(rng, rows)
     true = motion.at(t)
     noisy = true + noise * rng.standard_normal(rows)
-    level = NoiseLevel(noise, True, "")
-    begin = time.process_time()
-    found = follow(t, noisy, level)
-    seconds = time.process_time() - begin
+    found, seconds = studies.timed(follow, t, noisy, NoiseLevel(noise, True, ""))
     off = found.at(t) - true
     stderr = np.linalg.norm(found.modes(t), axis=1)
     held = np.abs(off) < Z95 * stderr
@@ -203,7 +194,7 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterato
             over = float(np.sign(height - heights[i]) * (found.at(here)[0] - height))
             turn["height"] = over / noise
             turn["height_z"] = over / np.linalg.norm(found.modes(here))
-            if not motion.holds:
+            if not motion.holds.size:
                 turn["late"] = rows * float(here[0] - at)
         yield turn
 
@@ -211,8 +202,8 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterato
 def table(data: pd.DataFrame, by: str) -> pd.DataFrame:
     """Return means over draws."""
     motions, turns = data[data.what == "motion"], data[data.what == "turn"]
-    m, found = motions.groupby(by, sort=False), turns[turns.found.eq(True)]
-    f = found.groupby(by, sort=False)
+    m = motions.groupby(by, sort=False)
+    f = turns[turns.found.eq(True)].groupby(by, sort=False)
 
     def held(values: pd.Series) -> float:
         return 100.0 * float((values.dropna().abs() < Z95).mean())
@@ -278,8 +269,8 @@ def main() -> None:
         "sigma": f"{sigma.quantile(0.025):.2f} to {sigma.quantile(0.975):.2f}",
     }  # fmt: skip
     whole = options.draws >= 25 and options.seed == 0
-    with tempfile.TemporaryDirectory() as folder:
-        print(studies.write_page(HERE, HERE if whole else Path(folder), **values))
+    with studies.workplace() as folder:
+        print(studies.write_page(HERE, HERE if whole else folder, **values))
 
 
 if __name__ == "__main__":

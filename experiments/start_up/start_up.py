@@ -15,8 +15,8 @@ import resource
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -70,40 +70,34 @@ def write(folder: Path, rows: int) -> Path:
     return studies.write_test(path, TOML, time=(t - t[0]).round(10), **columns)
 
 
-def run(command: list[str], cache: str | None = None) -> tuple[float, float, str]:
-    """Run a command with its own cache; return wall and processor time (s) and output."""
-    variables = os.environ | {"MPLBACKEND": "Agg"} | ({"NUMBA_CACHE_DIR": cache} if cache else {})
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    began = time.perf_counter()
-    done = subprocess.run(command, check=True, env=variables, capture_output=True, text=True)
-    wall = time.perf_counter() - began
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return wall, used, done.stdout
+def run(command: list[str], **variables: str) -> tuple[float, float, str]:
+    """Run a command; return wall and processor time (s) and output."""
+    own = os.environ | {"MPLBACKEND": "Agg"} | variables
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    done = subprocess.run(command, check=True, env=own, capture_output=True, text=True)
+    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return wall, sum(after[:2]) - sum(before[:2]), done.stdout  # user and system
 
 
-def measure(test: Path, folder: str, first: int, warm: int) -> dict[str, float]:
+def measure(test: Path, first: int, warm: int) -> dict[str, float]:
     """Return medians of first use, warm use, its processor time, and the parts."""
-    out = f"{folder}/result"
+    out = str(test.parent / "result")
     fit = [sys.executable, "-m", "foamfit", "fit", str(test), "--quiet", "--out", out]
     probe = [sys.executable, "-c", PROBE, str(test), out]
-    found: dict[str, list[float]] = {}
-
-    def keep(name: str, value: float) -> None:
-        found.setdefault(name, []).append(value)
-
+    found = defaultdict[str, list[float]](list)
     for _ in range(first):
-        with tempfile.TemporaryDirectory() as cache:
-            keep(f"first use, from command to report (median of {first})", run(fit, cache)[0])
+        with studies.workplace() as cache:
+            wall = run(fit, NUMBA_CACHE_DIR=str(cache))[0]
+        found[f"first use, from command to report (median of {first})"].append(wall)
     run(fit)  # compiles the rest
     for _ in range(warm):
         wall, used, _ = run(fit)
-        keep(f"warm, from command to report (median of {warm})", wall)
-        keep("processor time of its first process", used)
+        found[f"warm, from command to report (median of {warm})"].append(wall)
+        found["processor time of its first process"].append(used)
         wall, _, printed = run(probe)
         parts = [float(part) for part in printed.split()]
         for name, part in zip(PARTS, [wall - sum(parts[1:]), *parts[1:]], strict=True):
-            keep(f"– {name}", part)
+            found[f"– {name}"].append(part)
     return {name: statistics.median(values) for name, values in found.items()}
 
 
@@ -112,9 +106,8 @@ def main() -> None:
         __doc__, HERE, rows=600, first=(3, "fits at first use"), warm=(9, "fits once compiled")
     )
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        test = write(Path(folder), options.rows)
-        measured = measure(test, folder, options.first, options.warm)
+    with studies.workplace() as folder:
+        measured = measure(write(folder, options.rows), options.first, options.warm)
     rows = ((name, f"{seconds:.2f}") for name, seconds in measured.items())
     table = studies.markdown([f"{options.rows} rows", "wall time (s)"], rows)
     print(table)
