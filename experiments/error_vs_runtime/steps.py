@@ -16,7 +16,7 @@ import numpy as np
 
 import foamfit as ff
 from foamfit.solve.compiled import loop
-from foamfit.solve.plan import plan
+from foamfit.solve.plan import NO_DIRECTIONS, plan
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from studies import BLUE, ORANGE
@@ -33,10 +33,9 @@ def step_ends(chain: ff.Chain, time: np.ndarray) -> np.ndarray:
     rows, heights = chain.arrays[:2]
     for most in range(2, 200):
         scene = plan(chain, IMPACT, time, max_steps=most)._replace(implicit=False)
-        out, log = np.empty((1, 2, time.size)), np.empty((0, 5))
-        endings, none = np.empty(loop.ENDINGS), np.empty((0, 2), np.int64)
-        reals = scene._reals(rows, heights, RTOL, 0.0, 0)
-        scene._integrate(rows, heights, none, out, log, endings, reals, 0)
+        out, log, endings = np.empty((1, 2, time.size)), np.empty((0, 5)), np.empty(loop.ENDINGS)
+        reals = scene._reals(rows, heights, RTOL, 0.0)
+        scene._integrate(rows, heights, b"\0", NO_DIRECTIONS, out, log, endings, reals)
         ends.append(endings[loop.ENDED])
         if endings[loop.OUTCOME] == 0.0:
             break
