@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from timeit import timeit
 from typing import Any
@@ -233,17 +234,6 @@ class Timed:
     first: float
     times: list[float] = field(default_factory=list)
 
-    @property
-    def at_once(self) -> int:
-        """Number of runs that are timed together."""
-        return max(1, round(SHORTEST / self.first))
-
-    def measure(self) -> None:
-        """Time one run, or several short ones together."""
-        if self.first < BRIEF:  # the previous run has displaced the caches
-            self.run()
-        self.times.append(seconds(self.run, self.at_once))
-
     def row(self) -> dict[str, Any]:
         """Return a row of the table."""
         quartiles = np.percentile(self.times or [self.first], [50, 25, 75])
@@ -278,14 +268,14 @@ def measure(scene: Scene, budget: float) -> pd.DataFrame:
 def take_turns(timed: list[Timed], budget: float) -> None:
     """Time all solvers in turn, as often as each one's share of the budget (s) allows."""
     share = budget / len(timed)
-    turns = [
-        min(max(round(share / (one.first * one.at_once)), 3), ROUNDS) if one.first < SLOW else 0
-        for one in timed
-    ]
-    for turn in range(ROUNDS):
-        for one, count in zip(timed, turns, strict=True):
-            if (turn + 1) * count // ROUNDS > turn * count // ROUNDS:
-                one.measure()
+    for turn, one in product(range(ROUNDS), timed):
+        together = max(1, round(SHORTEST / one.first))
+        count = min(max(round(share / (one.first * together)), 3), ROUNDS)
+        count = count if one.first < SLOW else 0
+        if (turn + 1) * count // ROUNDS > turn * count // ROUNDS:
+            if one.first < BRIEF:  # the previous run has displaced the caches
+                one.run()
+            one.times.append(seconds(one.run, together))
 
 
 # ---------------------------------------------------------------- figures and tables
