@@ -395,3 +395,16 @@ def test_the_standard_error_covers_the_true_contact(kind, noise, rows):
         off.append((contact - CONTACT) / error)
     assert np.max(np.abs(off)) < 4.0
     assert np.sqrt(np.mean(np.square(off))) < 1.7
+
+
+@pytest.mark.parametrize("kind", ["kink", "soft"])
+def test_any_length_of_rest_shows_the_same_contact(kind):
+    """After 20,000 rows of rest the first rise was taken for a part of it."""
+    rng, time = np.random.default_rng(0), np.arange(-20_000, 250) / 250.0
+    values = rise(kind, time) + 1e-2 * rng.standard_normal(time.size)
+    noise, found = estimated_noise(values), []
+    for first in (0, 19_800):
+        before = 20_000 - first
+        found.append(rise_of(time[first:], values[first:], noise, before, 1e-2 / before**0.5))
+    assert found[0] == pytest.approx(found[1], abs=0.5 * found[1][1])
+    assert abs(found[0][0]) < 3.0 * found[0][1]

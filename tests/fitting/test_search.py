@@ -54,6 +54,20 @@ def test_the_stress_drive_fits_the_displacement():
     assert result.misfit["stress_strain"] < 0.02
 
 
+def test_a_branch_may_be_moved_by_a_parameter_that_is_not_determined():
+    """Branch c fixes eps_star alone; at one eps_c 16 of 25 intervals of kc contained the truth."""
+    spring, off = ff.published["foam-1/model-1"].bistable, []
+    strain = np.linspace(0.0, 0.38, 200)
+    for seed in range(8):
+        noise = 0.01 * np.ptp(spring.stress(strain)) * np.random.default_rng(seed).normal(size=200)
+        loading = spring.stress(strain) + noise, strain * 1e-3, Specimen(1e-3, 2e-5)
+        result = ff.fit(loop_measurement(*loading), intervals="local")
+        assert result.parameters["s1_eps_c"].state == "not determined"
+        kc = result.parameters["s1_kc"]
+        off.append((kc.value - spring.kc) / kc.stderr)
+    assert np.sqrt(np.mean(np.square(off))) < 1.7
+
+
 def test_a_branch_that_was_never_reached_is_not_determined():
     _, measurement = synthetic_impact(velocity=1.75, samples=201)
     result = ff.fit(measurement, starts=4)

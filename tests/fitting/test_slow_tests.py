@@ -44,6 +44,50 @@ def test_a_machine_that_moves_before_contact_with_an_arbitrary_zero(
     assert max(found.misfit["displacement_time"], found.misfit["stress_strain"]) < 0.01
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_noise_of_a_driving_stress_counts(seed: int) -> None:
+    """Of a test with a hold 8 of 21 intervals contained the truth."""
+    law = {
+        "k0": 1.2e6, "kc": 1.8e7, "dsigma": -5.9e4, "eps_a": 0.14, "eps_c": 0.45, "kh_plus": 1.1e6,
+        "kh_minus": 4.2e5,
+    }  # fmt: skip
+    rng, time = np.random.default_rng(seed), np.linspace(0.0, 30.0, 1501)
+    stress = np.interp(time, [0.0, 10.0, 20.0, 30.0], [0.0, 1.2e6, 1.2e6, 0.0])
+    chain = ff.Chain([ff.BistableSpring(**law)], [HEIGHT], 1e-4)
+    motion = ff.simulate(chain, ff.StressDrive(stress), time).displacement[-1]
+    noisy = [x + s * rng.standard_normal(time.size) for x, s in ((stress, 2.4e3), (motion, 6e-6))]
+    test = loop_measurement(*noisy, SPECIMEN, time)
+    found = ff.fit(test, drive="stress", intervals="local")
+    assert_near(found, law, 3.5)
+
+
+def test_the_zero_of_a_record_that_begins_in_contact_is_open() -> None:
+    """With an offset of 3 % of the peak k0 was 40 % too large, with a range of 10 %."""
+    time, offset = np.linspace(0.0, 8.0, 600), 0.03
+    strain = 0.6 * (1.0 - np.abs(time / 4.0 - 1.0))
+    spring = ff.MicroscaleSpring(**LAW | {"sigma_minus": 3e5}, relaxation=[(0.3, 2.0), (0.3, 0.1)])
+    chain = ff.Chain([spring], [HEIGHT], 1e-4)
+    stress = ff.simulate(chain, ff.DisplacementDrive(strain * HEIGHT), time).base_stress
+    noise = np.random.default_rng(0).standard_normal(time.size)
+    read = np.maximum(stress, 0.0) + offset * stress.max() + 1e-3 * stress.max() * noise
+    test = loop_measurement(read, strain * HEIGHT, SPECIMEN, time)
+    k0 = ff.fit(test, model="microscale", relaxation=1, starts=4).parameters["s1_k0"]
+    assert k0.range[0] < LAW["k0"] < k0.range[1]
+
+
+def test_parameters_of_a_crushed_foam_are_weak() -> None:
+    """A fit of loading and unloading determined what the loading alone excludes."""
+    strain = 0.6 * (1.0 - np.abs(np.linspace(-1.0, 1.0, 401)))
+    stress = ff.MicroscaleSpring(**LAW).stress(strain)
+    stress[201:] = np.maximum(stress[200] - 8e6 * (0.6 - strain[201:]), 0.0)
+    noisy = stress + NOISE * np.random.default_rng(0).standard_normal(401)
+    found = ff.fit(loop_measurement(noisy, strain * HEIGHT, SPECIMEN), model="microscale", starts=4)
+    assert any(
+        "zero again at" in one and "% of the largest strain" in one for one in found.warnings
+    )
+    assert not any(one.state == "determined" for one in found.parameters.values())
+
+
 # -------------------------------- a foam that the platen leaves on its way back, and a glued one
 
 LAW = {

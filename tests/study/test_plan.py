@@ -280,6 +280,21 @@ def test_files_and_terminal(soft, of_quantity, tmp_path, monkeypatch):
     assert set(study.kinds.values()) == {"shared"}
 
 
+def test_a_study_of_the_next_test_reads_the_tests_at_hand_as_they_were_fitted(
+    of_quantity, tmp_path
+):
+    """A fit of cycle 2 became one of cycle 1, and fixed parameters were free again."""
+    fixed = replace(of_quantity, held={"s1_k0": 5.5e6})
+    fixed.write(tmp_path, pages=False)
+    (tmp_path / "next.csv").touch()
+    study = read_study(tmp_path / "joint.toml")
+    assert (study.held, study.drive) == ({"s1_k0": 5.5e6}, "impact")
+    second = replace(of_quantity.tests[0], cycle=2, cycles=(1, 2))
+    (tmp_path / "second").mkdir()
+    replace(of_quantity, tests=(second,)).write(tmp_path / "second", pages=False)
+    assert not (tmp_path / "second/joint.toml").exists()
+
+
 def slow_test() -> Measurement:
     """A triangular loop of a microscale spring to a strain of 0.5 in 2 s, with 1 kPa of noise."""
     rng, time = np.random.default_rng(0), np.linspace(0.0, 2.0, 401)

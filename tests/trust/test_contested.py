@@ -122,6 +122,15 @@ def test_a_lag_of_the_force_determines_nothing_until_it_is_fitted(tmp_path: Path
     assert far(fitted, made.truth) == []
 
 
+def test_a_stated_delay_that_the_record_excludes_is_named(tmp_path: Path) -> None:
+    """Eight standard deviations off, kc was determined, seven errors from the truth."""
+    made = record_of(2, delay_sd=0.1)
+    stated = replace(made, delay_sd=abs(made.truth["time_shift"]) / 10.0)
+    result = ff.fit(ff.read_test(rig.write(stated, tmp_path)), model="microscale", **QUICK)
+    assert any("correct delay under [motion]" in one for one in result.warnings)
+    assert far(result, made.truth) == []
+
+
 @pytest.mark.parametrize(
     ("more", "kw", "words"),
     [
