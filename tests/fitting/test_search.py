@@ -47,13 +47,6 @@ def test_a_loop_without_time_is_fitted_in_the_displacement_drive():
     assert result.parameters["s1_kc"].value == pytest.approx(spring.kc, rel=0.05)
 
 
-def test_the_stress_drive_fits_the_displacement():
-    _, measurement = synthetic_loop()
-    result = ff.fit(measurement, drive="stress", intervals="local")
-    assert result.misfit["stress_time"] is None
-    assert result.misfit["stress_strain"] < 0.02
-
-
 def test_a_branch_may_be_moved_by_a_parameter_that_is_not_determined():
     """Branch c fixes eps_star alone; at one eps_c 16 of 25 intervals of kc contained the truth."""
     spring, off = ff.published["foam-1/model-1"].bistable, []
