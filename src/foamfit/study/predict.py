@@ -342,12 +342,14 @@ def _by_parameters(
 
 
 def _by_motion(problem: Problem, point: Array) -> dict[str, Array]:
-    """Return half the 95 % band (n,) due to the uncertainty of a driving motion, SI."""
+    """Return half the 95 % band (n,) due to the uncertainty of a driving motion or stress, SI."""
     objective, out = problem.objective, dict[str, Array]()
-    changes, level = objective.by_motion(point), objective.measurement.noise.of("displacement")
-    if changes is None or objective.motion is None or level is None:
+    channel = "stress" if objective.drive == "stress" else "displacement"
+    changes, level = objective.by_motion(point), objective.measurement.noise.of(channel)
+    smooth = objective.scenes.smooth
+    if changes is None or smooth is None or level is None:
         return out
-    size = np.linalg.norm(objective.motion.modes(objective.time), axis=1)
+    size = np.linalg.norm(smooth.modes(objective.time), axis=1)
     share = np.minimum(1.0, level.sigma / np.maximum(size, 1e-300))
     samples = np.arange(objective.time.size)
     for name, part in objective.by_curve(np.linalg.norm(changes, axis=1)).items():
