@@ -350,6 +350,19 @@ class Problem:
         return follow(self.tied, values, moves, 1e-5 * self.sizes(names, values))
 
 
+def _copied(params: lmfit.Parameters) -> lmfit.Parameters:
+    """Return a copy, as the caller's must not change; InputError if an expression has no value."""
+    try:
+        own = params.copy()
+        values = own.valuesdict()
+    except (ArithmeticError, NameError, RecursionError, TypeError, ValueError) as error:
+        raise InputError(f"an expression of params cannot be evaluated: {error}") from None
+    for name, value in values.items():
+        if own[name].expr and not np.isfinite(value):
+            raise InputError(f"the expression {name} = {own[name].expr} gives {value}")
+    return own
+
+
 def _check_expressions(params: lmfit.Parameters) -> None:
     """Raise InputError for an expression with a nuisance parameter."""
     for name, parameter in params.items():
@@ -416,6 +429,8 @@ def _prior(name: str, value: object, model: Model) -> nuisance.Prior:
             f"{where} = {value!r} must be a mean and a positive standard deviation {pair}, or a "
             f'text like "{example}"'
         )
+    if not ADMISSIBLE[wanted := any_param(split_name(name)[1]).admissible](mean):
+        raise InputError(f"{where} = {value!r} is not admissible: its mean must be {wanted}")
     return nuisance.Prior(name, mean, sigma)
 
 
@@ -454,7 +469,7 @@ def make_problem(
     )  # fmt: skip
     measurement = objective.measurement  # it has the noise of each channel
     wanted = make_params(measurement, model, drive, time_shift=time_shift)
-    params = lmfit.Parameters() if params is None else params.copy()  # do not change the caller's
+    params = lmfit.Parameters() if params is None else _copied(params)
     if unknown := [name for name in params if name not in wanted]:
         raise InputError(
             f"parameter '{unknown[0]}' is not one of the model {model.name}; "

@@ -85,6 +85,8 @@ def _as_history(values: ArrayLike, name: str) -> Array:
     history = np.ascontiguousarray(as_samples(values, name))
     if history.ndim > 1:
         raise InputError(f"{name} must be one history (one dimension), not {history.ndim}")
+    if not history.size:
+        raise InputError(f"{name} must have at least one sample")
     if not np.all(np.isfinite(history)):
         raise InputError(f"{name} must be finite; sample {_first(~np.isfinite(history))} is not")
     return np.atleast_1d(history)

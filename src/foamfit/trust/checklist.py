@@ -20,8 +20,9 @@ from foamfit.data.zeros import CONTRADICTED
 from foamfit.errors import InputError
 from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
+from foamfit.fitting.levenberg import descend
 from foamfit.fitting.nuisance import TIME_SHIFT
-from foamfit.fitting.search import SearchRecord
+from foamfit.fitting.search import SearchRecord, Tracker, squares
 from foamfit.parts import ParameterEstimate
 from foamfit.results import Check, Intervals
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
@@ -40,6 +41,7 @@ STATED, ESTIMATED = 1.1, 1.5
 BOUGHT = 0.02
 # The curves contradict a prior if they differ by more than this many standard deviations of both.
 AGAINST = 3.0
+ALONE = 60  # iterations of a descent without a prior
 # The stress is gone below this share of its peak, and a specimen has recovered below this share of
 # the largest strain.
 GONE, RECOVERED = 0.02, 0.5
@@ -246,24 +248,26 @@ def _of_intervals(
 def _of_priors(best: BestPoint, estimates: Estimates, with_error: Sequence[str]) -> Iterator[Check]:
     """Check whether the curves alone agree with each prior of the user and with a stated delay.
 
-    The value without a prior is one linear step away from the best point.
+    A descent from the best point without a prior gives the value that the curves alone say. A fit
+    that ends far from its prior contradicts it, whatever other minimum that descent meets.
     """
-    problem, against = best.problem, list[dict[str, Any]]()
+    problem, names, against = best.problem, tuple(with_error), list[dict[str, Any]]()
     stated = [prior for prior in problem.objective.priors if prior.name == TIME_SHIFT]
     given = [one for one in (*problem.objective.given, *stated) if one.name in with_error]
-    sizes = problem.sizes(tuple(with_error), best.values)
-    columns = best.jacobian[:, [*map(best.names.index, with_error)]]
+    objective, space, sizes = problem.objective, problem.space(), problem.sizes(names, best.values)
     for prior in given:
-        place = with_error.index(prior.name)
-        others = np.arange(len(columns)) != (
-            problem.objective.n_data + problem.objective.priors.index(prior)
-        )
-        rows, residual = columns[others], best.residual[others]
-        move = _step(rows, residual, sizes)
-        error = float(covariance(rows, residual, problem.objective.sizes, sizes).stderr[place])
-        low, high = estimates[prior.name].range or (0.0, 0.0)
-        error, alone = max(error, 0.25 * (high - low)), best.value(prior.name) + float(move[place])
-        if abs(alone - prior.mean) > AGAINST * math.hypot(prior.sigma, error):
+        others = np.arange(best.residual.size) != objective.n_data + objective.priors.index(prior)
+        functions = squares(Tracker(objective), space, others)
+        end = descend(*functions, space.encode(best.values), space.box, ALONE, enough=1e-6)
+        values = space.decode(end.point)
+        slopes = problem.slopes(values, names)[others]
+        found = covariance(slopes, end.residual, objective.sizes, sizes)
+        error, alone = float(found.stderr[names.index(prior.name)]), values[best.index[prior.name]]
+        if end.cost > objective.floor:  # the law errs
+            low, high = estimates[prior.name].range or (0.0, 0.0)
+            error = max(error, 0.25 * (high - low))
+        off, far = abs(alone - prior.mean), abs(best.value(prior.name) - prior.mean)
+        if off > AGAINST * math.hypot(prior.sigma, error) or far > AGAINST * prior.sigma:
             told = {"prior": prior, "alone": alone, "error": error, "unit": unit_of(prior.name)}
             against.append(told)
     if given:
