@@ -52,7 +52,7 @@ SCENES: dict[str, tuple[ff.Chain, Drive]] = {
     "motion that opens a gap, damped": (chain(damped([HELD, SOFT], 0.0, 30.0)), PULLED),
     "motion that opens a gap, interior mass": (chain([HELD, SOFT], [5e-5, 0.0]), PULLED),
     "stress": (chain([BISTABLE]), STRESS),
-    "stress, dashpot": (chain(damped([BISTABLE], 20.0)), STRESS),
+    "stress, dashpot": (chain(damped([BISTABLE], 40.0)), STRESS),
     "stress on two": (chain(PAIR), STRESS),
     "stress on two, one damped": (chain(damped(PAIR, 0.0, 30.0)), STRESS),
     "stress, viscous top": (chain(damped(PAIR, 0.0, 30.0), site=300.0), STRESS),

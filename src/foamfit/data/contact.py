@@ -29,6 +29,7 @@ _LARGEST = 0.5  # else this share
 ELSEWHERE = 5.0  # standard errors of a displacement that is significantly not zero
 _RISE_SHARE = 0.05  # least share of the peak at which the first rise ends
 _WINDOWS = 64  # moving means up to the peak, which show this level above the noise
+_LATER = 3.0  # standard errors by which a motion leaves its rest after the stress
 _LOW = 0.25  # share of that level from which the duration of the rise is measured
 _BEFORE, _ROWS_BEFORE = 6, 60  # rows before the rise: multiples of its duration, and more
 _TRIALS, _ROWS = 80, 240  # trial times, and most rows (means of blocks)
@@ -247,6 +248,9 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
     if start and float(w[onset]) - first > _APPROACH * float(w[top] - w[onset]):
         return replace(start, gauge="flight")
     if at := leave_rest(time[: top + 1], w[: top + 1], levels["displacement"]):
+        # Where a stress drives a foam with a dashpot, the motion follows it later.
+        if start and start.time + _LATER * float(np.hypot(start.error, at[1])) < at[0]:
+            return replace(start, gauge="rest")
         return replace(_at_kink("displacement", time, at, "motion"), gauge="rest")
     crossing = int(np.argmax(w >= 0.0))
     load = float(stress[crossing] - np.median(stress[: crossing // 4 + 1]))

@@ -121,7 +121,9 @@ def condition(
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
     noise |= _of_velocity(whole, impact=impact)
-    contact_time = whole.origins.get("contact_time", 0.0)
+    begins, per = whole.origins.get("contact_time", 0.0), 1
+    if whole.time is None:  # in samples from the first one kept, each of `block` rows
+        begins, per = (0 if used.place else span.first) + 0.5 * (block - 1), block
     test = _measured(
         whole,
         record,
@@ -134,7 +136,7 @@ def condition(
         cycle=used.number,
         cycles=tuple(cycle.number for cycle in found) or (1,),
         last_cycle=used.last,
-        rise=rise and (rise[0] - contact_time, rise[1]),
+        rise=rise and ((rise[0] - begins) / per, rise[1] / per),
         flight=flight,
     )
     return with_gravity(test) if impact else test

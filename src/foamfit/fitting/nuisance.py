@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import INTEGRATED, Measurement
 from foamfit.data.noise import lowest_mean
 from foamfit.springs.parameters import NUISANCE
@@ -155,7 +156,8 @@ def _motion_at(measurement: Measurement, contact: float) -> tuple[float, float, 
     values, level = measurement.displacement, measurement.noise.of("displacement")
     assert values is not None
     time = np.arange(values.size, dtype=float) if measurement.time is None else measurement.time
-    at, top = int(np.searchsorted(time, contact)), int(np.argmax(values))
+    first = next(iter(cycles_of(measurement).values()), slice(None))  # of several cycles
+    at, top = int(np.searchsorted(time, contact)), int(np.argmax(values[first]))
     reach = max(3, (top - at) // _NEAR)
     near = slice(max(0, at - reach), at + reach + 1)
     since = time[near] - contact

@@ -239,6 +239,8 @@ class Objective:
         if self.scenes.smooth is None:
             return None
         modes = self.scenes.smooth.modes(self.scenes.clock)
+        if self.drive == "stress" and (zero := self.measurement.zeros.get("stress", 0.0)):
+            modes = np.column_stack((modes, np.full(len(modes), zero)))
         out = np.empty((self.n_data, modes.shape[1]))
         for column, mode in zip(out.T, modes.T, strict=True):
             sides = [self._moved_by(side * mode).residual(values) for side in (-0.5, 0.5)]
@@ -279,7 +281,7 @@ class Objective:
             counts = counts & self.measurement.sampled.get("displacement", every)
         outliers = self.measurement.outliers.get(channel)
         if self.drive == "stress":
-            counts = counts & shows_motion(self.scenes.drives)
+            counts = counts & shows_motion(self.scenes.driving(self.time))
         return np.flatnonzero(counts if outliers is None else counts & ~outliers.left_out)
 
     # ------------------------------------------------------------------ simulation and residual

@@ -98,7 +98,8 @@ class Scenes:
         assert test.stress is not None  # checked by check_drive
         self.driven = self.drive == "displacement"
         self.time = np.arange(test.stress.size, dtype=float) if test.time is None else test.time
-        self._fine = min(test.block, FINEST) if self.drive != "stress" else 1
+        sampled = self.drive == "stress" and self.smooth is None
+        self._fine = 1 if sampled else min(test.block, FINEST)
         self.clock, self._own = instants(self.time, self._fine, self.averaged), None
         if self.driven:
             own = self.clock
@@ -131,10 +132,9 @@ class Scenes:
             return smooth_stress(self.measurement, self.time)
         return self.motion if self.driven else None
 
-    @cached_property
-    def drives(self) -> Array:
-        """The driving stress, Pa, (n,)."""
-        return driving_stress(self.measurement, self.model, self.time, self.smooth)
+    def driving(self, times: Array) -> Array:
+        """Return the driving stress at some instants, Pa."""
+        return driving_stress(self.measurement, self.model, times, self.smooth)
 
     @cached_property
     def _moved(self) -> Array:
@@ -169,7 +169,7 @@ class Scenes:
             usual = self.usual
             return Impact(usual[nuisances.STRIKER_MASS], usual[nuisances.VELOCITY], self._gravity)
         if self.drive == "stress":
-            return StressDrive(self.drives)
+            return StressDrive(self.driving(self.clock))
         return DisplacementDrive(self._moved)
 
     def _make(self, loading: Drive) -> dict[bool, Plan]:

@@ -331,6 +331,9 @@ def lost_height(best: BestPoint) -> float:
     last = int(np.flatnonzero(loaded)[-1]) + 1
     if last >= loaded.size or test.last_cycle is not None:
         return 0.0
+    # A load that the noise does not hide is no loss, though small against the peak.
+    if level and float(np.median(test.stress[last:])) > 2.0 * level.sigma:
+        return 0.0
     share = float(test.displacement[last] / test.displacement.max())
     return share if share > RECOVERED else 0.0
 

@@ -72,6 +72,8 @@ def fastest_rates(
         stiff = 1.0 / soft if soft > 0.0 else 0.0
         if soft == 0.0 and end - i0 == 1:
             stiff = steep[i0] / heights[i0]
+            if top == STRESS and eta[i0] != 0.0:  # it settles against its dashpot
+                relaxation = max(relaxation, steep[i0] / eta[i0])
         elif end - i0 > 1:
             rates = [(steep[i] + heights[i] * stiff) / eta[i] for i in own if eta[i] != 0.0]
             relaxation = max(relaxation, *rates, 0.0)
