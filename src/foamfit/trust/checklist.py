@@ -241,8 +241,9 @@ def _of_intervals(
             if bound == 0.0 and may_vanish(name):
                 natural.append(name)
             else:
-                stuck.append((name, bound))
-    yield _check("bounds", not stuck, stuck=stuck, natural=natural)
+                stuck.append((name, bound + best.problem.measurement.origins.get(name, 0.0)))
+    unknowns = [(name, bound, unit_of(name)) for name, bound in stuck if name in NUISANCE]
+    yield _check("bounds", not stuck, stuck=stuck, natural=natural, unknowns=unknowns)
 
 
 def _of_priors(best: BestPoint, estimates: Estimates, with_error: Sequence[str]) -> Iterator[Check]:
