@@ -83,8 +83,6 @@ class Profile:
     points: Array  # (m, n): all parameters of the model
     cut: float  # χ² of the 95 % interval
     ci95: tuple[float, float]  # outermost crossings of the cut, or limits of the parameter
-    open_low: bool  # whether the cost stays below the cut down to the lower limit
-    open_high: bool  # the same up to the upper limit
     stopped: str | None = None  # what ended it early: "the time limit" or "Ctrl-C"
 
     @property

@@ -180,16 +180,12 @@ def test_the_profile_of_a_linear_problem_is_the_local_interval(name, rho):
     )
     expected = ((found.values - around.values[column]) / around.spread.stderr[column]) ** 2
     assert found.rises == pytest.approx(expected, abs=1e-6)
-    assert not found.open_low
-    assert not found.open_high
 
 
 def test_a_limit_ends_an_interval():
     around = curve(low=0.29)
     found = profile(around, "b")
     assert found.ci95[0] == 0.29
-    assert found.open_low
-    assert not found.open_high
 
 
 def test_the_ends_of_a_profile_satisfy_the_cut_by_an_independent_refit(impact):

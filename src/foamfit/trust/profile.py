@@ -222,8 +222,6 @@ def trace(best: BestPoint, name: str, tracker: Tracker) -> tuple[Profile, Array 
         points=np.array([at.point for at in refits]),
         cut=low.quantile**2,
         ci95=(low.bound, high.bound if begun else best.value(name)),
-        open_low=low.bracket[1] is None,
-        open_high=high.bracket[1] is None,
         stopped=stopped,
     )
     return profile, better
