@@ -49,7 +49,6 @@ from foamfit.trust.ranges import Open, left_open
 from foamfit.trust.settle import (
     back_to_plain,
     descend_again,
-    follow_samples,
     held_by_record,
     keep_to_record,
     refine,
@@ -383,7 +382,7 @@ def _search(
         progress(REFINED, "refinement")
         descend_again(problem, tracker)
         problem, freed = keep_to_record(problem, tracker, asked, search_held)
-        problem, record = follow_samples(problem, tracker), replace(record, freed=freed)
+        record = replace(record, freed=freed)
         weigh_motion(problem, tracker)
         settle_ends(tracker, problem.space())
     except STOPPING as error:

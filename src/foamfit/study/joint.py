@@ -32,7 +32,7 @@ from foamfit.study.joint_parameters import result_of
 from foamfit.study.joint_result import JointResult
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
-from foamfit.trust.settle import follow_samples, keep_to_record, weigh_motion
+from foamfit.trust.settle import keep_to_record, weigh_motion
 
 # Number of tests fitted by a full search; the others start at the results of these.
 SEARCHED = 3
@@ -300,6 +300,5 @@ def _own_fit(
     if tracker.best_values is None:
         return _own_fit(measurement, model, params, options, ())
     problem, _ = keep_to_record(problem, tracker, options.vary)
-    problem = follow_samples(problem, tracker)
     weigh_motion(problem, tracker)
     return _Own.of(problem, tracker, tracker.best_values)

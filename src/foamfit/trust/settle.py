@@ -124,31 +124,6 @@ def _misfit(problem: Problem, values: Array) -> float:
     return max(value / float(np.ptp(objective.measured[name])) for name, value in rms.items())
 
 
-def follow_samples(problem: Problem, tracker: Tracker) -> Problem:
-    """Follow the samples of a driving motion, if its smooth curve is followed 5 % worse.
-
-    The curve may be smoother than the motion. Where its residual is noise, it is not: on a steep
-    branch the samples would add their own noise to the strain.
-    """
-    smooth, ends = problem.objective, tracker.ends
-    if tracker.best_values is None or smooth.drive != "displacement" or smooth.motion is None:
-        return problem
-    values, cost = tracker.best_values, tracker.best_cost
-    if not errs(BestPoint(problem, values)):
-        return problem
-    rough = replace(problem, objective=replace(smooth, followed=(None,)))
-    trial = Tracker(rough.objective, tracker.deadline, ends=[values])
-    descend_again(rough, trial)
-    if trial.best_cost * WORSE**2 < cost:
-        trial.ends = [*trial.ends, *ends]
-        descend_again(rough, trial)
-    if trial.best_values is None or trial.best_cost * WORSE**2 >= cost:
-        return problem
-    tracker.objective, tracker.ends = rough.objective, trial.ends
-    tracker.best_values, tracker.best_cost = trial.best_values, trial.best_cost
-    return rough
-
-
 def weigh_motion(problem: Problem, tracker: Tracker) -> None:
     """Weight the residual by the covariance due to the motion's own uncertainty, and refine.
 
