@@ -505,21 +505,6 @@ def test_compare_and_fit_keep_what_they_read(here: Path, fitted: tuple[Path, Res
 # Run as a separate process.
 
 
-def process(*args: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "foamfit", *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-def test_the_process_keeps_stdout_and_stderr_apart(here: Path) -> None:
-    good = process("published")
-    assert (good.returncode, good.stderr) == (0, "")
-    assert good.stdout.startswith("Published")
-    bad = process("fit", write(here, rows=["x"]), "--out", "no")
-    assert (bad.returncode, bad.stdout, bad.stderr.count("\n")) == (1, "", 1)
-    assert "Traceback" not in bad.stderr
-    assert not (here / "no").exists()
-
-
 def test_the_light_commands_import_nothing_heavy() -> None:
     heavy = "{'numba', 'pandas', 'matplotlib', 'scipy', 'lmfit', 'pint'}"
     script = (

@@ -113,13 +113,10 @@ def test_a_shift_between_force_and_motion_is_warned_of_and_fitted(late):
     assert f"{word} against the force by" in warning
     result = ff.fit(test, time_shift=True, starts=2, intervals="local")
     item = result.parameters["time_shift"]
-    assert item.unit == "s"
-    assert item.state == "determined"
+    assert (item.unit, item.state) == ("s", "determined")
     assert abs(item.value - late) < max(3 * item.stderr, 0.05 * abs(late))
-    assert item.ci95[0] < item.value < item.ci95[1]
     assert worst_deviation(result, spring) < 4.0
     assert not [w for w in result.warnings if "--time-shift" in w]
-    assert result.params["time_shift"].value == item.value
     assert "time shift Δt" in summary_text(result)
 
 
