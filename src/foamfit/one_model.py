@@ -250,7 +250,8 @@ def identify(
     better = None if options.watch is None else partial(options.watch, problem)
     tracker = Tracker(problem.objective, deadline, better)
     tracker.looked = None if look is None else partial(look, problem)
-    record = SearchRecord(options.seed, starts, began, compiled=SPENT.seconds)
+    led = below is not None
+    record = SearchRecord(options.seed, starts, began, compiled=SPENT.seconds, led=led)
     known = [] if below is None else carried(problem.space(), below.problem.space(), below.minima())
     problem, record = _search(problem, tracker, record, options.vary, progress, known)
     if tracker.best_values is None:

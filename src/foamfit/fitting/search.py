@@ -100,6 +100,7 @@ class SearchRecord:
     stopped: str | None = None  # Why it ended early: "the time limit", "Ctrl-C", "SIGTERM"
     freed: Freed | None = None  # What free contact time and zeros would gain where the law errs
     compiled: float = 0.0  # `cache.SPENT` at its start, s
+    led: bool = False  # Whether it began from the minima of a poorer model, with fewer starts
 
     @property
     def agreeing(self) -> int:
