@@ -249,7 +249,8 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
         return replace(start, gauge="flight")
     if at := leave_rest(time[: top + 1], w[: top + 1], levels["displacement"]):
         # Where a stress drives a foam with a dashpot, the motion follows it later.
-        if start and start.time + _LATER * float(np.hypot(start.error, at[1])) < at[0]:
+        later = start and start.time + _LATER * float(np.hypot(start.error, at[1])) < at[0]
+        if start and later and _has_risen(time, stress, start.first, at[0], levels["stress"]):
             return replace(start, gauge="rest")
         return replace(_at_kink("displacement", time, at, "motion"), gauge="rest")
     crossing = int(np.argmax(w >= 0.0))
@@ -258,6 +259,15 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
         how = "where the displacement passes zero"
         return Start(how, float(time[crossing]), crossing, by="motion", gauge="other")
     return _at_first(time)
+
+
+def _has_risen(time: Array, stress: Array, first: int, end: float, noise: NoiseLevel) -> bool:
+    """Return whether the stress has left its rest between a sample and an instant."""
+    rows, rest = stress[first : int(np.searchsorted(time, end))], stress[:first]
+    if not (rows.size and rest.size):
+        return False
+    error = noise.sigma * np.sqrt(noise.time * (1.0 / rows.size + 1.0 / rest.size))
+    return bool(rows.mean() - rest.mean() > _ERRORS * error)
 
 
 def rise_of(

@@ -69,6 +69,7 @@ class _Samples:
         gram = (basis.T @ basis).toarray()
         little = 1e-9 * np.trace(gram) / np.trace(penalty)  # keeps pieces without samples regular
         rough, rotation = linalg.eigh(penalty, gram + little * penalty)
+        rough = np.maximum(rough, np.finfo(float).eps * rough[-1])  # smaller ones are rounding
         rough[:_ORDER] = 0.0
         basis, data = basis @ rotation, 1.0 - little * rough
         return cls(x, y, knots, rotation, basis, data, rough, basis.T @ y)

@@ -69,8 +69,9 @@ def thinned(
     acceleration = measurement.acceleration
     return replace(
         measurement, displacement=None if motion is None else motion[keep], stress=stress[keep],
-        time=None if time is None else time[keep], outliers={}, sampled=masks, noise=level,
-        block=1 if loop else measurement.block,
+        # Without time the clock still counts the samples of the whole record.
+        time=keep.astype(float) if time is None else time[keep], outliers={}, sampled=masks,
+        noise=level, block=1 if loop else measurement.block,
         interior={} if loop else {n: one[keep] for n, one in measurement.interior.items()},
         acceleration=None if loop or acceleration is None else acceleration[keep],
     )  # fmt: skip
