@@ -267,7 +267,7 @@ def _has_risen(time: Array, stress: Array, first: int, end: float, noise: NoiseL
     if not (rows.size and rest.size):
         return False
     error = noise.sigma * np.sqrt(noise.time * (1.0 / rows.size + 1.0 / rest.size))
-    return bool(rows.mean() - rest.mean() > _ERRORS * error)
+    return bool(rows.mean() - rest.mean() > _CLEAR * error)
 
 
 def rise_of(

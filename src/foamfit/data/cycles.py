@@ -222,23 +222,15 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
 def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
     """Use a stress significantly below zero after the first of several cycles as its zero.
 
-    A preloaded specimen may become free only after the first cycle. Of the first cycle alone, whose
-    zero was measured before it, this is the error.
+    A preloaded specimen may become free only after the first cycle.
     """
-    first = cycle.place == 0 and len(cycles) > 1 and "stress" in record.zeros
-    if cycle.last is None and not first:
+    if cycle.last is None:
         return record
     zero, error = _level_between(record, cycles, cycle.place)
     between = record.stress[cycles[cycle.place].top : cycles[cycle.place + 1].top]
     tension = min(zero, lowest_mean(between, 0)[0])
     if zero > -_SURE * error or _is_glued(record, tension, float(record.stress[cycle.top])):
         return record
-    if cycle.last is None:
-        record = replace(record, zeros=record.zeros | {"stress": -zero})
-        level = engineering(zero, "Pa")
-        return record.noted(
-            f"The stress falls to {level} between the first two cycles: its zero is as uncertain."
-        )
     record = replace(record.shifted("stress", zero), zeros=record.zeros | {"stress": error})
     return record.noted(_offset_note("between the first two cycles", zero))
 
