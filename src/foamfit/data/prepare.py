@@ -121,9 +121,6 @@ def condition(
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
     noise |= _of_velocity(whole, impact=impact)
-    begins, per = whole.origins.get("contact_time", 0.0), 1
-    if whole.time is None:  # in samples from the first one kept, each of `block` rows
-        begins, per = (0 if used.place else span.first) + 0.5 * (block - 1), block
     test = _measured(
         whole,
         record,
@@ -136,10 +133,20 @@ def condition(
         cycle=used.number,
         cycles=tuple(cycle.number for cycle in found) or (1,),
         last_cycle=used.last,
-        rise=rise and ((rise[0] - begins) / per, rise[1] / per),
+        rise=rise and _on_clock(rise, whole, block, 0 if used.place else span.first),
         flight=flight,
     )
     return with_gravity(test) if impact else test
+
+
+def _on_clock(rise: contact.Kink, record: Record, block: int, first: int) -> contact.Kink:
+    """Return a rise in the file's time, s, or rows, on the clock of the samples.
+
+    Without time it counts samples from the `first` row kept, each of which is `block` rows.
+    """
+    if record.time is not None:
+        return rise[0] - record.origins.get("contact_time", 0.0), rise[1]
+    return (rise[0] - first - 0.5 * (block - 1)) / block, rise[1] / block
 
 
 def _of_velocity(record: Record, *, impact: bool) -> dict[str, NoiseLevel]:

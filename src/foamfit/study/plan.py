@@ -150,7 +150,6 @@ def plan(
     left = [name for name in known.names if name not in shown]
     never = _beyond(known, left, limits, impacts=not contradicted)
     progress(0.97, "the velocity that closes the loop")
-    drives = {one.problem.objective.drive for one in tests}
     return Plan(
         tests=tuple(one.problem.measurement for one in tests),
         model=known.problem.model.name,
@@ -166,7 +165,7 @@ def plan(
         rivals=tuple(others),
         missed=known.missed > 0.0,
         contradicted=contradicted,
-        drive=drives.pop() if len(drives) == 1 else None,
+        drives=frozenset(one.problem.objective.drive for one in tests),
         held=_held(tests[0].problem),
         seed=seed,
     )

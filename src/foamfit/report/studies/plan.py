@@ -130,7 +130,7 @@ class Plan(Result, OfLaw):
     #: whether force, mass and motion of the record contradict each other as well; an impact of the
     #: same rig then determines nothing
     contradicted: bool
-    drive: str | None  #: of the tests at hand; None: they have several
+    drives: frozenset[str]  #: of the tests at hand
     held: dict[str, float]  #: spring parameters that the user has fixed, SI
     seed: int
 
