@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -165,8 +166,7 @@ def plan(
         rivals=tuple(others),
         missed=known.missed > 0.0,
         contradicted=contradicted,
-        drives=frozenset(one.problem.objective.drive for one in tests),
-        held=_held(tests[0].problem),
+        **_as_fitted(tests),
         seed=seed,
     )
 
@@ -174,12 +174,14 @@ def plan(
 # ------------------------------------------------------------------ the tests at hand
 
 
-def _held(problem: Problem) -> dict[str, float]:
-    """Return spring parameters that are held elsewhere than by default, SI."""
+def _as_fitted(tests: Sequence[Test]) -> dict[str, Any]:
+    """Return the drives, and the spring parameters held elsewhere than by default, SI."""
+    problem, drives = tests[0].problem, {one.problem.objective.drive for one in tests}
     usual = make_params(problem.measurement, problem.model, problem.objective.drive)
     params = {name: problem.params[name] for name in problem.model.names}
     held = {n: one.value for n, one in params.items() if not one.vary and one.expr is None}
-    return {n: x for n, x in held.items() if usual[n].vary or usual[n].value != x}
+    held = {n: x for n, x in held.items() if usual[n].vary or usual[n].value != x}
+    return {"drives": frozenset(drives), "held": held}
 
 
 def _contradicted(tests: Sequence[Test]) -> bool:
