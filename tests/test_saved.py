@@ -29,7 +29,7 @@ def odd() -> ff.FitResult:
     n = base.curves.time.size
     gone = np.arange(n) % 50 == 3
     rest = np.array([1.0, 2.5])
-    profile = Profile("s1_k0", rest, rest, np.ones((2, 3)), 3.84, (1.0, 2.0), False, True)
+    profile = Profile("s1_k0", rest, rest, np.ones((2, 3)), 3.84, (1.0, 2.0))
     test = replace(
         base.measurement,
         name="=1+1 $α_β$ % \\ [x]",
