@@ -168,7 +168,7 @@ class BestPoint:
         if {zero, CONTACT_TIME} <= out.keys() and not at_rest:
             out[zero] = out[zero] + out.pop(CONTACT_TIME)
         objective, force = self.problem.objective, "stress_zero"
-        if objective.driven and not {force} & {*out, *self.names}:
+        if objective.driven and force not in (*out, *self.names):
             error = open_zero(self.problem.measurement, glued=bool(objective.glued))
             out[force] = error * self.problem.slopes(self.values, (force,))[:, 0]
         return np.reshape([*out.values()], (-1, self.residual.size)).T

@@ -329,7 +329,7 @@ def lost_height(best: BestPoint) -> float:
     assert test.displacement is not None
     level, peak = test.noise.of("stress"), float(test.stress.max())
     loaded = test.stress > max(GONE * peak, 4.0 * (level.sigma if level else 0.0))
-    last = int(np.flatnonzero(loaded)[-1]) + 1
+    last = int(np.flatnonzero(loaded)[-1]) + 1 if loaded.any() else loaded.size  # hidden by noise
     if last >= loaded.size or test.last_cycle is not None:
         return 0.0
     # A load that the noise does not hide is no loss, though small against the peak.
