@@ -79,7 +79,7 @@ class Record:
         moved = c.displacement if measured is None else measured
         if c.measured_stress is None or moved is None:
             raise InputError(f"{test.name} has no measured loop; a card needs force and motion")
-        if not impact and any(one["motion_smoothed"] for one in result.noise.values()):
+        if not impact and any(one.get("motion_smoothed") for one in result.noise.values()):
             times = np.arange(moved.size, dtype=float) if c.time is None else c.time
             smooth = driving_motion(with_noise(test), times, always=True)  # as in the fit
             moved = moved if smooth is None else smooth.at(times)

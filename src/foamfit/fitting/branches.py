@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -53,15 +54,15 @@ def unreached(problem: Problem, simulated: Simulated) -> dict[str, str]:
     return out
 
 
-def silent(problem: Problem, simulated: Simulated) -> set[str]:
-    """Return the unreached parameters that moved no branch which was reached."""
+def silent(problem: Problem, simulated: Simulated, names: Iterable[str]) -> set[str]:
+    """Return those of the `unreached` parameters that moved no branch which was reached."""
     seen = visited(problem, simulated)
 
     def moved(name: str) -> bool:
         branch, spring = problem.model.param(name).moves, split_name(name)[0]
         return branch in covered(seen[f"s{spring + 1}"])
 
-    return {name for name in unreached(problem, simulated) if not moved(name)}
+    return {name for name in names if not moved(name)}
 
 
 def _states(problem: Problem, simulated: Simulated) -> list[tuple[int, dict[int, str]]]:

@@ -235,7 +235,7 @@ class Objective:
         return self._moved_by(0.0).residual(values)[: self.n_data]
 
     def by_motion(self, values: Array) -> Array | None:
-        """Return the change of the residual by each mode of the motion, (n_data, m), or None."""
+        """Return the change of the residual by each mode of what drives, (n_data, m), or None."""
         if self.scenes.smooth is None:
             return None
         modes = self.scenes.smooth.modes(self.scenes.clock)

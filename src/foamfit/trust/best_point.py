@@ -72,7 +72,7 @@ class BestPoint:
         """Names of the k parameters on which the curves depend."""
         if self.chosen is not None:
             return self.chosen
-        without = silent(self.problem, self.simulated)
+        without = silent(self.problem, self.simulated, self.unreached)
         return tuple(name for name in self.problem.free() if name not in without)
 
     @property
@@ -168,8 +168,8 @@ class BestPoint:
         if {zero, CONTACT_TIME} <= out.keys() and not at_rest:
             out[zero] = out[zero] + out.pop(CONTACT_TIME)
         objective, force = self.problem.objective, "stress_zero"
-        if objective.driven and force not in (*out, *self.names):
-            error = open_zero(self.problem.measurement, glued=bool(objective.glued))
+        error = open_zero(self.problem.measurement, glued=bool(objective.glued))
+        if error and objective.driven and force not in (*out, *self.names):
             out[force] = error * self.problem.slopes(self.values, (force,))[:, 0]
         return np.reshape([*out.values()], (-1, self.residual.size)).T
 

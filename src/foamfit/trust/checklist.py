@@ -319,11 +319,14 @@ def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:
 def lost_height(best: BestPoint) -> float:
     """Return the share of the largest strain at which a slow unloading ends, if it is large.
 
-    0 if the stress lasts below half of the strain, or if the model relaxes or is damped.
+    0 if the stress lasts below half of the strain, if the model relaxes or is damped, or if the law
+    does not err.
     """
     test, model = best.problem.measurement, best.problem.model
     damped = any(best.value(name) for name in model.names if name.endswith("_eta"))
     if best.problem.objective.drive != "displacement" or model.relaxation or damped:
+        return 0.0
+    if not (best.names and best.misfits):
         return 0.0
     assert test.stress is not None
     assert test.displacement is not None
@@ -340,8 +343,8 @@ def lost_height(best: BestPoint) -> float:
 
 
 def _recovery(best: BestPoint) -> Iterator[Check]:
-    """Check whether the specimen follows the motion back, where the law errs."""
-    if best.names and best.misfits and (lost := lost_height(best)):
+    """Check whether the specimen follows the motion back."""
+    if lost := lost_height(best):
         yield _check("recovery", False, lost=lost)
 
 
@@ -381,14 +384,9 @@ def _one_step(
     problem, residual = best.problem, best.residual
     jacobian = np.column_stack([best.jacobian[:, [*map(best.names.index, with_error)]], column])
     sizes = np.append(problem.sizes(tuple(with_error), best.values), size)
-    move = _step(jacobian, residual, sizes)
+    move = sizes * np.linalg.lstsq(jacobian * sizes, -residual, rcond=1e-10)[0]
     left = residual + jacobian @ move
     if left @ left >= 0.8 * float(residual @ residual):
         return None
     spread = covariance(jacobian, left, problem.objective.sizes, sizes)
     return float(move[-1]) if abs(move[-1]) > 4.0 * spread.stderr[-1] else None
-
-
-def _step(jacobian: Array, residual: Array, sizes: Array) -> Array:
-    """Return the Gauss-Newton step of parameters with the scales `sizes`."""
-    return np.asarray(sizes * np.linalg.lstsq(jacobian * sizes, -residual, rcond=1e-10)[0])

@@ -235,7 +235,7 @@ def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict
         "stopped": not intervals.ranged,
         "vibrates": objective.interior_mass,
         "begun": model.relaxation and any(UNDER_LOAD in note for note in test.notes),
-        "lost": lost_height(best) if errs else 0.0,
+        "lost": lost_height(best),
         "alone": errs and not (record.stopped or record.led) and 0 < record.agreeing < 2,
         "off": misfit if misfit > POOR else 0.0,
         "curve": curve,

@@ -141,7 +141,7 @@ class Plan(Result, OfLaw):
             if one.path is None:
                 return f"{one.name} has no record"
             if one.cycle != min(one.cycles) or one.last_cycle is not None:
-                return f"{one.name} is not the first cycle alone, and a study reads one of each"
+                return f"{one.name} was fitted with other cycles; a study reads the first of each"
         return ""
 
     @property
