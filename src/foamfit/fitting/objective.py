@@ -45,6 +45,7 @@ OF_DRIVE = ("those of the drive",)  # default of `Objective.nuisance`
 # law to measured foams have misfits above 1 %: a smaller noise must not let one channel outweigh
 # the other, as the residuals of both are then errors of the law.
 MODEL_ERROR = 0.005
+MOST_EXPLAINED = 1.5  # largest RMS residual over that of noise, as an estimated noise is uncertain
 NORMAL = 1.4826  # standard deviation of normal residuals over their median absolute value
 RANKING = 1e-3  # allowed error of the simulations that rank starts on a thinned record
 THIN = 0.8  # a record is thinned if at most this fraction of its samples is left
@@ -106,6 +107,8 @@ class Objective:
     spent: Spent = field(default_factory=Spent)
     # Largest amplitude, in standard deviations, of the motion that would explain the residual
     unexplained: float | None = field(default=None, init=False)
+    # Whether noise, that of the drive included, explains the size of the residual
+    explained: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:
         """Prepare the scenes and the scale of each curve."""
@@ -217,6 +220,7 @@ class Objective:
         """
         uncertain = self.by_motion(values)
         if uncertain is None:
+            self.explained = False
             return False
         plain = self.plain(values)
         levels = [
@@ -224,6 +228,9 @@ class Objective:
             for name, part in self.by_curve(np.abs(plain)).items()
         ]
         weighing = Weighing.of(uncertain, np.repeat(levels, self.sizes), values)
+        noises = [self.noise(name).sigma * self.factor(name) for name in self.counted]
+        expected = np.sum(np.repeat(noises, self.sizes) ** 2) + np.sum(uncertain**2)
+        self.explained = bool(plain @ plain <= MOST_EXPLAINED**2 * expected)
         if not weighing.explains(plain):
             self.unexplained = float(np.abs(weighing.amplitudes(plain)).max())
             return False

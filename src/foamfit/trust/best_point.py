@@ -131,8 +131,10 @@ class BestPoint:
     def to_judge(self, taken: Array | None = None) -> tuple[Any, ...]:
         """Return the arguments of `curve_errors`; `taken` is the noise absorbed by a joint fit."""
         objective = self.problem.objective
-        # Noise of a driving stress, or of a velocity before its integration, has slow waves.
-        slow = set(range(len(objective.sizes))) if objective.drive == "stress" else set[int]()
+        # Noise of a driving stress that explains the residual has slow waves, as has that of a
+        # velocity before its integration.
+        by_stress = objective.drive == "stress" and objective.explained
+        slow = set(range(len(objective.sizes))) if by_stress else set[int]()
         if objective.drive == "impact" and is_velocity(test := self.problem.measurement):
             every = "stress" in test.derived
             motion = "displacement_time"
