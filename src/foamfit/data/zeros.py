@@ -226,7 +226,7 @@ def _zero_of_motion(
     source = zero.source(noise, "line through") + (" around it" if flies else " from there on")
     size, stress = float(np.ptp(values)), record.stress
     loaded = not impact and stress[:3].mean() > 0.05 * stress.max() and 0.0 < zero.value < size
-    least = max(ELSEWHERE * zero.error, (0.1 if impact else 0.02) * size)
+    least = max(ELSEWHERE * zero.error, 0.1 * size if impact else 0.0)
     keep = not flies and (loaded or abs(zero.value) <= least)
     return NOTHING if keep else zero, source
 
