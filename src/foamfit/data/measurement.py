@@ -379,6 +379,12 @@ class Measurement(Samples):
         """Return the available ones of stress, displacement, acceleration, interior motions."""
         return self.curves("acceleration")
 
+    @property
+    def instants(self) -> Array:
+        """Time, or sample numbers without a time, shape (n,)."""
+        n = next(iter(self.channels().values())).size
+        return np.arange(n, dtype=np.float64) if self.time is None else self.time
+
 
 def is_velocity(test: Record | Measurement) -> bool:
     """Return whether the motion is the integral of a recorded velocity."""

@@ -223,8 +223,7 @@ def driven_instants(measurement: Measurement, clock: Array, motion: SmoothMotion
     more = [] if motion is None else motion.turns.tolist()
     values = measurement.displacement
     if values is not None and measurement.contact != "file" and not measurement.start_strain:
-        time = measurement.time
-        time = np.arange(values.size, dtype=float) if time is None else time
+        time = measurement.instants
         (at, then), (first, second) = clock[:2], moved_at(clock[:2], time, values, motion)
         late = first / (second - first) if second > first else -1.0
         more += [at - late * (then - at)] if 0.0 < late < LATEST else []

@@ -155,7 +155,7 @@ def _motion_at(measurement: Measurement, contact: float) -> tuple[float, float, 
     """
     values, level = measurement.displacement, measurement.noise.of("displacement")
     assert values is not None
-    time = np.arange(values.size, dtype=float) if measurement.time is None else measurement.time
+    time = measurement.instants
     first = next(iter(cycles_of(measurement).values()), slice(None))  # of several cycles
     at, top = int(np.searchsorted(time, contact)), int(np.argmax(values[first]))
     reach = max(3, (top - at) // _NEAR)

@@ -97,7 +97,7 @@ class Scenes:
         test = self.measurement
         assert test.stress is not None  # checked by check_drive
         self.driven = self.drive == "displacement"
-        self.time = np.arange(test.stress.size, dtype=float) if test.time is None else test.time
+        self.time = test.instants
         sampled = self.drive == "stress" and self.smooth is None
         self._fine = 1 if sampled else min(test.block, FINEST)
         self.clock, self._own = instants(self.time, self._fine, self.averaged), None

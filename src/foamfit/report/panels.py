@@ -232,8 +232,7 @@ def _mark_outliers(ax: Axes, panel: Panel, result: Fit) -> None:
         if not channel.startswith(own) or not x.size:
             continue
         if panel.is_loop and motion is not None:
-            time = np.arange(motion.size) if test.time is None else test.time
-            x = np.interp(x, time, motion) / test.specimen.height
+            x = np.interp(x, test.instants, motion) / test.specimen.height
         elif panel.is_loop or test.time is None:
             continue
         low, high = ax.get_ylim()  # fixed, so that an outlier does not shrink the curves
@@ -253,9 +252,8 @@ def _shade_standstills(ax: Axes, panel: Panel, result: Fit) -> None:
             ax.axvspan(start / fx, end / fx, lw=0.0, **style)
             continue
         for line in panel.lines:
-            instants = np.arange(line.x.size) if test.time is None else test.time
             if line.kind == "measured":
-                at = (instants >= start) & (instants <= end)
+                at = (test.instants >= start) & (test.instants <= end)
                 ax.plot(line.x[at] / fx, line.y[at] / fy, lw=7.0, solid_capstyle="butt", **style)
 
 

@@ -231,7 +231,7 @@ def _panels(found: Prediction) -> list[Panel]:
         panels.append(Panel("stress-strain", "strain", "–", "stress", "Pa", loop))
     for c in found.curves.values():
         timed = ("time", "s") if m.time is not None else ("sample", "–")
-        x = np.arange(c.measured.size, dtype=float) if m.time is None else m.time
+        x = m.instants
         lines = [Line(x, c.lo, *BAND, high=c.hi), *measured(x, c.measured)]
         lines += [Line(x, c.predicted, *PREDICTED)]
         halves = {"all": (0.5 * (c.hi - c.lo), "black", ":")}
