@@ -219,12 +219,25 @@ class Card:
         files = [path, *(path.with_name(f"{path.name}.{form}") for form in ("json", "png", "pdf"))]
         for one in files:
             check_file(one)
+        _check_own(path, files[1])
         figure = draw(self)
         text = json.dumps(self.to_json_dict(), indent=2, allow_nan=False) + "\n"
         contents = (self.text.encode(), text.encode(), *images(figure, "png", "pdf"))
         for one, content in zip(files, contents, strict=True):
             write_file(one, content)
         return path
+
+
+def _check_own(path: Path, beside: Path) -> None:
+    """Raise InputError if there is a file that is no card: FILE.json does not stand beside it."""
+    if not path.is_file():
+        return
+    try:
+        own = {"format", "curves"} <= json.loads(beside.read_bytes()).keys()
+    except (OSError, ValueError, AttributeError):
+        own = False
+    if not own:
+        raise InputError(f"{path} exists and is not a card of foamfit; choose another name")
 
 
 def draw(card: Card) -> Figure:

@@ -24,6 +24,7 @@ from scipy.signal import savgol_filter
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Specimen
+from foamfit.errors import SimulationError
 from foamfit.solve.simulation import Response, simulate
 from foamfit.springs.chain import DisplacementDrive
 from foamfit.study.identified import Source
@@ -33,6 +34,7 @@ POINTS = 100  # of a curve in a card
 # A curve ends at the strain END, or where its stress exceeds MOST times the largest stress within
 # the measured strain. It always covers the measured strain.
 END, MOST = 0.9, 10.0
+_ENDS = 20  # ends of the curves that are tried
 _FINE = 2000  # intervals of the strain from which the points are chosen
 _LEAST_SLOPE = 1e-3  # least slope of a curve over its mean slope within the measured strain
 _START = 0.01  # strain over which the initial jump due to a dashpot is spread
@@ -103,10 +105,8 @@ def loading_curves(
     outside the fitted ones it is the curve at the nearest fitted rate.
     """
     ends = (min(source.rates), max(source.rates)) if source.rates else (rates[0], rates[0])
-    fine = np.linspace(0.0, max(END, measured_to), _FINE + 1)
+    fine, raw = _reached(source, np.clip(rates, *ends).tolist(), measured_to)
     within = fine <= measured_to
-    inside = np.clip(rates, *ends).tolist()
-    raw = np.array([follow(source, rate, fine, fine / rate).base_stress for rate in inside])
     jumps = np.maximum(2.0 * raw[:, 1:2] - raw[:, 2:3], 0.0)
     raw = raw - jumps * np.maximum(1.0 - fine / _START, 0.0)
     raw[:, 0] = 0.0
@@ -119,6 +119,20 @@ def loading_curves(
     chosen = np.array([np.interp(strain, fine, one) for one in stress])
     crossed = bool(np.any(stress - rising > _CLOSE * scale))
     return Curves(np.array(rates), strain, chosen, measured_to), crossed
+
+
+def _reached(source: Source, rates: Sequence[float], measured_to: float) -> tuple[Array, Array]:
+    """Return strains up to the largest that the law reaches, and its stress there at each rate.
+
+    A bistable spring with a negative eps_star ends at a strain below one.
+    """
+    for end in np.linspace(max(END, measured_to), measured_to, _ENDS).tolist():
+        fine = np.linspace(0.0, end, _FINE + 1)
+        try:
+            return fine, np.array([follow(source, r, fine, fine / r).base_stress for r in rates])
+        except SimulationError as error:
+            ended = error
+    raise ended
 
 
 def _points(fine: Array, stress: Array, measured_to: float) -> Array:

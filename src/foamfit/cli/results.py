@@ -238,6 +238,11 @@ def card(result: Path, format: str, units: str, rates: str | None, out: Path | N
     options.compile_solver(False, source.model.name)
     made = cards.card(result, format=format, units=units, rates=asked)
     if out is None:
-        file.parent.mkdir(exist_ok=True)
+        try:
+            file.parent.mkdir(exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"{file.parent} cannot be made: {error.strerror}; give --out"
+            ) from None
     made.save(file)
     say(f"{made}\nwritten to {file}, with {file.name}.json, .png and .pdf beside it")

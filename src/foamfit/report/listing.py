@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.codec import build, plain
+from foamfit.codec import build, decode, plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.parts import ParameterEstimate, law_in_words
@@ -141,13 +141,14 @@ def _listed(path: Path) -> Row:
         rest = {
             k: v for k, v in given.items() if k not in ("model", "relaxation") and v is not None
         }
+        misfit = content.get("misfit") or _largest(content.get("tests", {}))
         every = content["parameters"].items()
         made = {n: {"vary": p.get("kind") != "fixed", **p} for n, p in every if n not in NUISANCE}
         return Row(
             str(content.get("test") or content.get("name")),
-            status=content["status"],
-            misfit=content.get("misfit") or _largest(content.get("tests", {})),
-            runtime_s=content.get("runtime_s"),
+            status=str(content["status"]),
+            misfit=decode(dict[str, float | None], misfit, {}),
+            runtime_s=decode(float | None, content.get("runtime_s"), {}),
             parameters={name: build(ParameterEstimate, p, {}) for name, p in made.items()},
             model=law_in_words(model.name, content.get("relaxation", 0)),
             options=", ".join(k if v is True else f"{k} {_shown(v)}" for k, v in rest.items()),
@@ -179,12 +180,17 @@ def small_loop(path: Path) -> tuple[str, ...]:
     """Return the measured and the fitted loop of a curves.csv as points of SVG polylines."""
     if not path.is_file():
         return ()
-    with path.open(encoding="utf-8") as file:
-        head = file.readline().strip().split(",")
-        if not {STRAIN, STRESS} <= set(head):
-            return ()
-        columns = [head.index(name) for name in (STRAIN, STRESS, FITTED) if name in head]
-        values = np.loadtxt(file, delimiter=",", usecols=columns, ndmin=2)
+    try:
+        with path.open(encoding="utf-8") as file:
+            head = file.readline().strip().split(",")
+            if not {STRAIN, STRESS} <= set(head):
+                return ()
+            columns = [head.index(name) for name in (STRAIN, STRESS, FITTED) if name in head]
+            values = np.loadtxt(file, delimiter=",", usecols=columns, ndmin=2)
+    except (OSError, ValueError):  # damaged
+        values = np.empty((0, 3))
+    if not len(values):
+        return ()
     values = values[np.unique(np.linspace(0, len(values) - 1, POINTS).astype(int))]
     low, high = values[:, :2].min(axis=0), values[:, :2].max(axis=0)
     span = np.where(high > low, high - low, 1.0)

@@ -226,7 +226,9 @@ def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
         for number, one in results.items()
         if (loop := one.loop) is not None and loop.label == "strain"
     ]
-    keep = np.unique(np.geomspace(1, max(len(loops), 1), MOST_LOOPS).astype(int)) - 1
+    keep = np.arange(len(loops))
+    if len(loops) > MOST_LOOPS:
+        keep = np.unique(np.geomspace(1, len(loops), MOST_LOOPS).astype(int)) - 1
     rows, panels = list(found.rows()), list[Panel]()
     for title, (column, factor) in BY_CYCLE.items():
         known = {f"cycle {row['cycle']}": row[column] for row in rows if row[column] is not None}
@@ -238,5 +240,5 @@ def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
         names,
         [*panels, *panels_of(names, found.varied)],
         width=width,
-        above=partial(draw_loops, [loops[i] for i in keep[: len(loops)]]),
+        above=partial(draw_loops, [loops[i] for i in keep]),
     )

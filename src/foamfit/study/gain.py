@@ -27,6 +27,7 @@ from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Impact
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.identified import NORMAL
+from foamfit.trust.checklist import may_vanish
 from foamfit.trust.covariance import NOTHING, WEAK
 from foamfit.trust.ranges import ALIKE
 
@@ -257,17 +258,23 @@ def covariance(known: Known, seen: Sequence[Seen], floor: float = TINY) -> tuple
 
 
 def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
-    """Return the expected interval and state of every parameter after some further tests."""
+    """Return the expected interval and state of every parameter after some further tests.
+
+    One that may vanish is weak in the draws in which its interval or range would contain zero.
+    """
     noise, law = (np.diagonal(one, axis1=1, axis2=2) for one in covariance(known, seen))
     halves, ranges = NORMAL * np.sqrt(noise), np.sqrt(np.maximum(law, 0.0))
-    shares, wide = halves / known.drawn_sizes, np.maximum(halves, ranges) / known.drawn_sizes
+    wider, places = np.maximum(halves, ranges), [known.problem.index[n] for n in known.names]
+    shares, wide = halves / known.drawn_sizes, wider / known.drawn_sizes
+    clear = np.abs(known.draws[:, places]) / known.sizes > wider
     reached = np.broadcast_to(known.reached, halves.shape)
     for one in seen:
         reached = reached | one.reached
     out = dict[str, Expected]()
     for i, name in enumerate(known.names):
         shown = reached[:, i]
-        chance = float(np.mean(shown & (wide[:, i] <= WEAK)))
+        sure = clear[:, i] if may_vanish(name) else True
+        chance = float(np.mean(shown & (wide[:, i] <= WEAK) & sure))
         some = float(np.mean(shown & (wide[:, i] <= NOTHING)))
         state = "determined" if chance >= 0.5 else "weak" if some >= 0.5 else "not determined"
         ends, share = np.full(3, math.nan), math.nan
