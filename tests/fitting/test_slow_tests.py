@@ -15,6 +15,10 @@ from foamfit.report.summary import summary_text
 
 HEIGHT, SPECIMEN = 10e-3, Specimen(10e-3, 1e-4)
 TOML = '[specimen]\nheight = "10 mm"\narea = "1 cm^2"\n'
+BISTABLE = {
+    "k0": 1.2e6, "kc": 1.8e7, "dsigma": -5.9e4, "eps_a": 0.14, "eps_c": 0.45, "kh_plus": 1.1e6,
+    "kh_minus": 4.2e5,
+}  # fmt: skip
 QUICK = {"starts": 4, "intervals": "local"}
 
 
@@ -52,18 +56,14 @@ def test_a_machine_that_moves_before_contact_with_an_arbitrary_zero(
 @pytest.mark.parametrize("seed", range(3))
 def test_the_noise_of_a_driving_stress_counts(seed: int) -> None:
     """Of a test with a hold 8 of 21 intervals contained the truth."""
-    law = {
-        "k0": 1.2e6, "kc": 1.8e7, "dsigma": -5.9e4, "eps_a": 0.14, "eps_c": 0.45, "kh_plus": 1.1e6,
-        "kh_minus": 4.2e5,
-    }  # fmt: skip
     rng, time = np.random.default_rng(seed), np.linspace(0.0, 30.0, 1501)
     stress = np.interp(time, [0.0, 10.0, 20.0, 30.0], [0.0, 1.2e6, 1.2e6, 0.0])
-    chain = ff.Chain([ff.BistableSpring(**law)], [HEIGHT], 1e-4)
+    chain = ff.Chain([ff.BistableSpring(**BISTABLE)], [HEIGHT], 1e-4)
     motion = ff.simulate(chain, ff.StressDrive(stress), time).displacement[-1]
     noisy = [x + s * rng.standard_normal(time.size) for x, s in ((stress, 2.4e3), (motion, 6e-6))]
     test = loop_measurement(*noisy, SPECIMEN, time)
     found = ff.fit(test, drive="stress", intervals="local")
-    assert_near(found, law, 3.5)
+    assert_near(found, BISTABLE, 3.5)
 
 
 @pytest.mark.parametrize("offset", [0.004, -0.004, 0.019])
@@ -71,19 +71,15 @@ def test_the_offset_of_a_motion_that_begins_in_contact_is_found(
     tmp_path: Path, offset: float
 ) -> None:
     """Below 2 % of the motion it was kept, and eps_c was 30 to 170 standard errors off."""
-    law = {
-        "k0": 1.2e6, "kc": 1.8e7, "dsigma": -5.86e4, "eps_a": 0.14, "eps_c": 0.45, "kh_plus": 1.08e6,
-        "kh_minus": 4.2e5,
-    }  # fmt: skip
     rng, time = np.random.default_rng(1), np.linspace(0.0, 20.0, 801)
     motion = 0.55 * HEIGHT * (1.0 - np.abs(time / 10.0 - 1.0))
-    chain = ff.Chain([ff.BistableSpring(**law)], [HEIGHT], 1e-4)
+    chain = ff.Chain([ff.BistableSpring(**BISTABLE)], [HEIGHT], 1e-4)
     stress = ff.simulate(chain, ff.DisplacementDrive(motion), time).base_stress
     curves = (stress / 1e3, 2e-3), (1e3 * motion + offset * 5.5, 5e-4)
     noisy = [one + s * np.ptp(one) * rng.standard_normal(time.size) for one, s in curves]
     head = "time (s),stress (kPa),displacement (mm)"
     path = write_csv(tmp_path / "slow.csv", head, time, *noisy, fmt="%.6f", toml=TOML)
-    assert_near(ff.fit(ff.read_test(path), intervals="local"), law, 3.5)
+    assert_near(ff.fit(ff.read_test(path), intervals="local"), BISTABLE, 3.5)
 
 
 def test_the_zero_of_a_record_that_begins_in_contact_is_open() -> None:

@@ -163,7 +163,8 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     and ends where the stress returns to that level. A level clearly below zero is an offset of the
     sensor, as a foam does not pull its platen for long. If the zero was measured before contact and
     the tension is more than that of a loose specimen, it is glued: then the level is zero. The
-    strain not recovered is `origins["start_strain"]`.
+    strain not recovered is `origins["start_strain"]`, and `origins["rested"]` the time, s, since
+    the load of the cycle before.
     """
     w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
     turn, end_of = cycle.turn, number if cycle.last is None else cycle.last
@@ -187,6 +188,8 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     back = np.flatnonzero(mean[turn : cycle.end] <= level)
     first, end = last + (share > 0.0), turn + int(back[0]) + 1 if back.size else cycle.end
     time = at_contact(record.instants)
+    before = int(np.flatnonzero(stress[: last + 1] > free + _STILL_LOADED * rise)[-1])
+    rested = time - float(record.instants[before])
     moment = "" if record.time is None else f" {engineering(time, 's')} in the file,"
     rises, returns = "from its level between the cycles", "to that level"
     if glued:
@@ -211,7 +214,7 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
         moved,
         interior={node: values - at_contact(values) for node, values in record.interior.items()},
         zeros={name: record.zeros[name] for name in moved.zeros.keys() & {"stress"}},
-        origins=moved.origins | {"start_strain": contact / height},
+        origins=moved.origins | {"start_strain": contact / height, "rested": rested},
         notes=(*cut_to_cycle(record, cycles, cycle).notes, *notes),
     )
     cut = moved.between(cycle.first, cycle.end, f"before cycle {number}", f"after cycle {end_of}")
@@ -361,11 +364,15 @@ def loading_rate(test: Measurement, fitted: Array | None = None) -> float | None
 
     if test.time is None or test.displacement is None:
         return None
-    time, motion, noise = test.time - test.time[0], test.displacement, test.noise.of("displacement")
+    time, motion, noise = test.time, test.displacement, test.noise.of("displacement")
     sigma = noise.sigma if noise else 0.0
     if fitted is not None:  # the peak of a smooth motion lies between samples
-        fine = np.linspace(0.0, time[-1], _FINE * time.size)
+        fine = np.linspace(time[0], time[-1], _FINE * time.size)
         time, motion, sigma = fine, CubicSpline(time, fitted)(fine), 0.0
+    if test.striker is not None and time[0] < 0.0:  # neither flight nor rest before contact loads
+        motion = np.append(np.interp(0.0, time, motion), motion[time > 0.0])
+        time = np.append(0.0, time[time > 0.0])
+    time = time - time[0]
     velocity = _velocity(time, motion, sigma)
     return None if velocity is None else velocity / test.specimen.height
 

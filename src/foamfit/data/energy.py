@@ -16,6 +16,8 @@ from foamfit.data.measurement import INTEGRATED, UNITS, Measurement, Striker
 from foamfit.data.noise import line_at, noise_level
 from foamfit.text import engineering, percent
 
+_OTHER_CYCLE = 0.95  # a motion falls below this share of its maximum between two cycles
+
 
 @dataclass(frozen=True)
 class EnergyAudit:
@@ -179,7 +181,11 @@ def largest_motion(displacement: Array, time: Array | None = None) -> tuple[int,
     The largest sample is biased by noise, so a quartic is fitted to the samples near the maximum.
     """
     floor = displacement.max() - 8.0 * noise_level(displacement)
-    near = np.flatnonzero(displacement >= floor)
+    below = displacement < min(floor, _OTHER_CYCLE * displacement.max())
+    between = np.concatenate(([-1], np.flatnonzero(below), [displacement.size]))
+    at = int(np.searchsorted(between, np.argmax(displacement)))
+    start, end = between[at - 1] + 1, between[at]
+    near = start + np.flatnonzero(displacement[start:end] >= floor)
     region = np.arange(near[0], near[-1] + 1)
     if len(region) < 12:
         top = int(np.argmax(displacement))

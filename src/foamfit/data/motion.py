@@ -68,7 +68,12 @@ class _Samples:
         penalty = bends.T @ (np.outer(half, weights).reshape(-1, 1) * bends)
         gram = (basis.T @ basis).toarray()
         little = 1e-9 * np.trace(gram) / np.trace(penalty)  # keeps pieces without samples regular
-        rough, rotation = linalg.eigh(penalty, gram + little * penalty)
+        while True:
+            try:
+                rough, rotation = linalg.eigh(penalty, gram + little * penalty)
+                break
+            except linalg.LinAlgError:  # pieces of a pause much longer than the step
+                little *= 10.0
         rough = np.maximum(rough, np.finfo(float).eps * rough[-1])  # smaller ones are rounding
         rough[:_ORDER] = 0.0
         basis, data = basis @ rotation, 1.0 - little * rough

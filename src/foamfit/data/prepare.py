@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array, means
-from foamfit.data import contact, cycles, frames, zeros
+from foamfit.data import blocks, contact, cycles, frames, zeros
 from foamfit.data import outliers as repair
 from foamfit.data.calibration import with_gravity
 from foamfit.data.measurement import (
@@ -51,8 +51,6 @@ _USUAL = {
     "modulus (peak stress over peak strain)": (10.0, 1e11, "Pa"),
     "duration": (1e-6, 1e7, "s"),
 }
-_MAX_ROWS = 1500  # more samples than this are averaged in blocks
-_BLOCKS = 1000  # number of these blocks, at most
 
 
 def condition(
@@ -116,8 +114,8 @@ def condition(
     else:
         record = replace(record, acceleration=None)
     whole = checks(record, specimen, given, several=used.last is not None)
-    record = thin(whole)
-    block = -(-len(whole) // len(record))
+    whole, block = (whole, blocks.usual(len(whole))) if impact else blocks.without_holds(whole)
+    record = blocks.thin(whole, block)
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
     noise |= _of_velocity(whole, impact=impact)
@@ -211,6 +209,7 @@ def _measured(
         outliers=outliers,
         count=count_rows(whole, outliers, block),
         start_strain=origins.pop("start_strain", 0.0),
+        rested=origins.pop("rested", None),
         sampled=thinned.sampled,
         zeros=whole.zeros,
         origins=origins,
@@ -422,21 +421,6 @@ def _never_positive(stress: Array) -> InputError:
         f"the stress is never positive in the part that is used, only {least} to {most}; correct "
         "its zero in the file, or choose another part or cycle by [window]."
     )
-
-
-def thin(record: Record) -> Record:
-    """Average a long record in blocks, which also reduces its noise."""
-    n = len(record)
-    if n <= _MAX_ROWS:
-        return record
-    size = -(-n // _BLOCKS)
-    edges = np.arange(0, n, size)
-    time = None if record.time is None else means(record.time, edges)
-    note = f"{n} samples are averaged in {len(edges)} blocks of {size}."
-    thinned = Record(time, record.stress, None, notes=(*record.notes, note))
-    for name, values in record.curves("acceleration").items():
-        thinned = thinned.changed(name, means(values, edges))
-    return frames.frames_of_blocks(record, thinned, edges)
 
 
 def count_rows(record: Record, outliers: dict[str, Outliers], block: int) -> RowCount:

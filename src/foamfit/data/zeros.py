@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.contact import ELSEWHERE, Levels, Start, motion_leaves_rest
+from foamfit.data.contact import ELSEWHERE, Levels, Start, motion_leaves_rest, straight
 from foamfit.data.measurement import (
     GRAVITY,
     UNITS,
@@ -23,6 +23,7 @@ from foamfit.data.noise import (
     level_on_line,
     line_at,
     mean_level,
+    quantum,
     smooth,
 )
 from foamfit.text import engineering, percent
@@ -143,7 +144,7 @@ def take_zeros(
                 note = f"Only {n} rows are certainly before contact: the zero of the {name} in the "
                 note += "file is kept."
             if zero.samples:
-                errors[name] = zero.error
+                errors[name] = float(np.hypot(zero.error, _of_steps(values, values[:n])))
         else:
             zero, source = _zero_of_motion(name, first, start, n, noise, impact=impact)
             top = name == "displacement"
@@ -154,6 +155,18 @@ def take_zeros(
                 note = f"{label} at contact, {size}, is taken off ({source})."
         record = record.shifted(name, zero.value).noted(*[note] * bool(note))
     return replace(record, zeros=errors)
+
+
+def _of_steps(values: Array, rest: Array) -> float:
+    """Return the error of a mean at rest due to the steps of the digitiser.
+
+    It averages out only as far as noise spreads the samples over several levels: steps q with
+    noise s leave the first harmonic, of amplitude exp(-2π²s²/q²).
+    """
+    if not (step := quantum(values)):
+        return 0.0
+    spread = (float(rest.std()) / step) ** 2 - 1.0 / 12.0 if rest.size >= MIN_REST else 0.0
+    return float(step / np.sqrt(12.0) * np.exp(-2.0 * np.pi**2 * max(spread, 0.0)))
 
 
 def without_drift(record: Record, start: Start, levels: Levels) -> Record:
@@ -221,6 +234,7 @@ def _zero_of_motion(
         return zero, zero.source(noise, "mean of") + " at rest before contact"
     flies = top and start.gauge == "flight"
     reach = max(5, (int(np.argmax(values)) - first) // (24 if flies else 12))
+    reach = reach if impact else straight(time, values, first, reach, noise)
     near = slice(max(0, first - reach) if flies else first, first + reach)
     zero = level_on_line(time[near], values[near], start.time, noise)[0]
     source = zero.source(noise, "line through") + (" around it" if flies else " from there on")

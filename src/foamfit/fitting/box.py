@@ -28,6 +28,8 @@ from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
 Tied = Callable[[Array], Array]
 # Coordinates of nuisance parameters at their two limits.
 NUISANCE_BOX = (-1.0, 1.0)
+_TENTHS = np.linspace(0.1, 1.0, 10)  # of the largest motion; the fastest is the rate of a ramp
+_RAMPS = 20  # ramps under load up to which the least relaxation time is that of its scale
 
 
 def is_logarithmic(short: str) -> bool:
@@ -43,6 +45,9 @@ class Scales:
     strain: float  # Largest overall strain
     rate: float  # Typical strain rate, 1/s; 0 without time
     height: float  # m
+    # Factor, at most 1, of the least relaxation time: its scale is the time under load, beside
+    # which a ramp before a long hold or rest is short.
+    least_time: float = 1.0
 
     @classmethod
     def of(cls, measurement: Measurement) -> Scales:
@@ -52,11 +57,22 @@ class Scales:
         strain = 0.5
         if measurement.displacement is not None:
             strain = min(max(float(np.max(measurement.displacement)) / height, 1e-6), 0.999)
-        rate = 0.0
-        if measurement.time is not None:
-            loaded = measurement.time[measurement.stress > 0.02 * np.max(measurement.stress)]
-            rate = 2.0 * strain / max(float(np.ptp(loaded)), 1e-300) if loaded.size > 1 else 0.0
-        return cls(float(np.max(measurement.stress)), strain, rate, height)
+        rate, least = 0.0, 1.0
+        if (time := measurement.time) is not None:
+            loaded = time[measurement.stress > 0.02 * np.max(measurement.stress)]
+            lasts = max(float(np.ptp(loaded)), 1e-300) if loaded.size > 1 else math.inf
+            rate = 2.0 * strain / lasts
+            if (motion := measurement.displacement) is not None:
+                steps = [int(np.argmax(motion >= s * motion.max())) for s in _TENTHS]
+                gaps = np.maximum(np.diff(time[steps]), np.diff(time).min())
+                least = min(1.0, _RAMPS * 10.0 * float(gaps.min()) / lasts)
+        return cls(float(np.max(measurement.stress)), strain, rate, height, least)
+
+    def limits(self, param: Param) -> tuple[float, float]:
+        """Return the limits of the coordinate of a parameter."""
+        low, high = param.limits
+        is_time = param.scale == "duration" and param.is_logarithmic
+        return (low + math.log(self.least_time) if is_time else low), high
 
     @property
     def slope(self) -> float:
@@ -207,8 +223,8 @@ class Space:
                 ends = 0.0, self.scales.unit(param.scale)
                 between = param.coordinate if isinstance(param.coordinate, Between) else ends
                 short = split_name(name)[1]
-                log, bounds = param.is_logarithmic, (low, high)
-                out.append(Coordinate(at, short, param, param.limits, bounds, between, of, log))
+                log, bounds, limits = param.is_logarithmic, (low, high), self.scales.limits(param)
+                out.append(Coordinate(at, short, param, limits, bounds, between, of, log))
         return out
 
     def _rank(self, name: str) -> int:

@@ -102,6 +102,7 @@ def make_params(
         param = model.param(name)
         value = param.start[0] * scales.unit(param.start[1])
         low, high = (bound * scales.unit(param.scale) for bound in param.bounds)
+        low *= scales.least_time if param.scale == "duration" else 1.0
         vary = short != "eta" or (on_striker if spring < 0 else fast and count == 1)
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)

@@ -281,6 +281,7 @@ def _spaces(problems: Sequence[Problem], absolute: Sequence[str]) -> list[Space]
         max(one.strain for one in every),
         float(np.median([one.rate for one in every])),
         max(one.height for one in every),
+        min(one.least_time for one in every),
     )
     count = len(problems[0].model.names)  # limits of nuisance parameters differ
     low = np.min([space.low[:count] for space in spaces], axis=0)

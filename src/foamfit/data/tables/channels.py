@@ -16,6 +16,7 @@ from foamfit.data.tables.signs import negative_channels
 from foamfit.data.units import LARGEST
 from foamfit.errors import InputError
 
+_COPIES = 0.9  # share of those that equal it in all channels, from which they are copies
 _COARSE = 0.1  # share of rows with the stamp of the row before, from which a clock is coarse
 
 
@@ -109,7 +110,9 @@ def _averaged(
     again = np.delete(rows, starts)
     if not again.size:
         return numbers, rows
-    if again.size > _COARSE * time.size and (even := _evenly(time)) is not None:
+    same = np.all([np.diff(values) == 0 for values in numbers.values()], axis=0)
+    copies = np.count_nonzero(same) > _COPIES * again.size  # whole rows, written several times
+    if not copies and again.size > _COARSE * time.size and (even := _evenly(time)) is not None:
         notes.append(
             f"{again.size} of {time.size} rows have the time stamp of the row before: the clock is "
             "coarser than the rows, which are even within its steps and are taken as even."

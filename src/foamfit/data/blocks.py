@@ -1,0 +1,70 @@
+"""Means of blocks of rows, to which long records are reduced."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from foamfit.arrays import Mask, means
+from foamfit.data import frames
+from foamfit.data.measurement import Record
+from foamfit.data.noise import noise_level, smooth
+
+_MAX_ROWS = 1500  # more samples than this are averaged in blocks
+_BLOCKS = 1000  # number of these blocks, at most, unless a ramp would have too few
+_OF_RAMP = 100  # blocks of the fastest ramp
+_MOST_BLOCKS = 10_000
+_MOVES = 0.001  # least change of a moving block, as a share of the range
+_BEYOND = 6.0  # standard deviations of noise above which a block moves
+
+
+def usual(rows: int) -> int:
+    """Return the rows in a block of a record without long holds; 1 if it is short."""
+    return -(-rows // _BLOCKS) if rows > _MAX_ROWS else 1
+
+
+def without_holds(record: Record) -> tuple[Record, int]:
+    """Leave out most rows of long holds and rests; return also the rows in a block of `thin`.
+
+    The means of a few large blocks of a ramp would not lie on the curves. Between many cycles there
+    is nothing to leave out: they have more blocks.
+    """
+    n, size = len(record), usual(len(record))
+    values = record.stress if record.displacement is None else record.displacement
+    steady = smooth(values, size // 2 + 1)
+    tenths = [int(np.argmax(steady >= 0.1 * k * steady.max())) for k in range(1, 11)]
+    block = max(1, 10 * int(np.diff(tenths).min()) // _OF_RAMP)
+    if record.time is None or 2 * block > size:
+        return record, size
+    while (moving := _moving(record, block)).sum() > _MOST_BLOCKS and block < size:
+        block *= 2
+    quiet = np.flatnonzero(~moving)
+    wanted = max(_BLOCKS - int(moving.sum()), _BLOCKS // 4)
+    moving[quiet[:: max(1, quiet.size // wanted)]] = True
+    gone = ~np.repeat(moving, block)[:n]
+    return record.without(gone, "in a hold or rest that fewer rows describe as well"), block
+
+
+def _moving(record: Record, block: int) -> Mask:
+    """Return in which blocks, or next to which, motion or stress changes by more than noise."""
+    edges = np.arange(0, len(record), block)
+    out = np.zeros(edges.size)
+    for values in (record.stress, record.displacement):
+        if values is not None:
+            change = np.abs(np.diff(means(values, edges)))
+            noise = _BEYOND * noise_level(values) * np.sqrt(2.0 / block)
+            out[1:] += change > max(noise, _MOVES * float(np.ptp(values)))
+    return np.convolve(out, np.ones(5), "same") > 0.5
+
+
+def thin(record: Record, size: int) -> Record:
+    """Average a long record in blocks of some rows, which also reduces its noise."""
+    n = len(record)
+    if size == 1:
+        return record
+    edges = np.arange(0, n, size)
+    time = None if record.time is None else means(record.time, edges)
+    note = f"{n} samples are averaged in {len(edges)} blocks of {size}."
+    thinned = Record(time, record.stress, None, notes=(*record.notes, note))
+    for name, values in record.curves("acceleration").items():
+        thinned = thinned.changed(name, means(values, edges))
+    return frames.frames_of_blocks(record, thinned, edges)
