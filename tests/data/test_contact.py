@@ -107,6 +107,16 @@ def test_rows_before_contact_do_not_change_the_strain_rate(gauge, before):
     assert loading_rate(done) == pytest.approx(moved / turn / HEIGHT, rel=0.02)
 
 
+def test_of_two_hits_the_first_is_used():
+    """The higher one was, against the velocity at the first: the fit failed."""
+    first, again = record("F"), record("F", before=9000, seed=1)
+    time = np.append(first.time, again.time - again.time[0] + first.time[-1] + DURATION / 500)
+    done = run(Record(time, np.append(first.stress, 1.1 * again.stress), None))
+    assert done.origins["contact_time"] == pytest.approx(0.0, abs=0.01 * DURATION)
+    assert done.time[-1] < 1.5 * DURATION
+    assert any("only the first contact is used" in note for note in done.notes)
+
+
 @pytest.mark.parametrize(("level", "least", "most"), [(1e-4, 0.28, 0.3), (0.01, 0.01, 0.1)])
 def test_the_zero_of_a_digitised_force_averages_with_noise_alone(level, least, most):
     """The rest lay on one level, its mean was exact: eta was ten standard errors off."""

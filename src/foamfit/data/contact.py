@@ -27,6 +27,7 @@ _ERRORS = 2.0  # standard errors added to the slope at rest
 _DRIFT, _DRIFT_AT_ZERO, _DRIFT_AWAY = 0.01, 0.002, 0.06
 _TOUCHING = 0.03  # largest stress at a contact where the motion passes zero, as a share of the peak
 _APPROACH = 0.02  # share of its travel beyond which a machine without load is not in contact
+_AGAIN = 0.1  # share of the peak above which a stress shows a contact
 _BRAKED = 0.02  # share of the peak of a derived stress at which contact starts
 _SHARES = 0.025, 0.05, 0.1, 0.2  # shares of the peak up to which a rise is taken as straight
 _CLEAR = 8.0  # the smallest share of at least this many standard deviations of noise is used
@@ -189,6 +190,25 @@ def _first_motion(time: Array, w: Array, noise: NoiseLevel) -> tuple[float, bool
     first = level_on_line(time[early], w[early], time[0], noise)[0]
     least = max(ELSEWHERE * first.error, 0.02 * (float(w[top]) - first.value))
     return first.value, top >= 5 and abs(first.value) > least  # not with fewer samples
+
+
+def first_contact(record: Record) -> Record:
+    """Leave out further contacts of a striker that rebounds and comes back.
+
+    The first contact has at least half of the largest stress; a flight lasts longer than twice the
+    longest contact.
+    """
+    stress, free = smooth(record.stress, 3), float(np.median(record.stress))
+    share = (stress - free) / max(float(stress.max()) - free, 1e-300)
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], share > _AGAIN, [False]))))
+    begins, ends = edges[::2], edges[1::2]
+    for end, begin in zip(ends[:-1], begins[1:], strict=True):
+        if share[:end].max() >= 0.5 and begin - end > 2 * (ends - begins).max():
+            why = "after the first contact, as the striker comes back"
+            return record.without(slice((end + begin) // 2, None), why).noted(
+                "The striker comes back after its rebound; only the first contact is used."
+            )
+    return record
 
 
 def start_of_impact(record: Record, levels: Levels, *, late: bool = False) -> Start:

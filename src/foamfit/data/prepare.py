@@ -81,6 +81,7 @@ def condition(
     still = [] if impact else repair.find_standstills(record)
     record = repair.bridge_standstills(repair.fill_staircase(record), still, specimen.height)
     excess = record.excess
+    record = contact.first_contact(record) if impact else record
     found = [] if impact else cycles.find_cycles(record)
     chosen = cycles.choose_cycles(found, window.cycle, window.last)
     used = chosen or cycles.Cycle(number=1, place=0, first=0, top=0, end=len(record), turn=0)

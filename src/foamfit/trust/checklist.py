@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from itertools import chain, groupby
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,7 @@ BOUGHT = 0.02
 # The curves contradict a prior if they differ by more than this many standard deviations of both.
 AGAINST = 3.0
 ALONE = 60  # iterations of a descent without a prior
+ASIDE = 0.0, -0.2, 0.2  # relative changes of its value, which may lie in a minimum of its own
 # The stress is gone below this share of its peak, and a specimen has recovered below this share of
 # the largest strain.
 GONE, RECOVERED = 0.02, 0.5
@@ -259,7 +261,11 @@ def _of_priors(best: BestPoint, estimates: Estimates, with_error: Sequence[str])
     for prior in given:
         others = np.arange(best.residual.size) != objective.n_data + objective.priors.index(prior)
         functions = squares(Tracker(objective), space, others)
-        end = descend(*functions, space.encode(best.values), space.box, ALONE, enough=1e-6)
+        aside = np.zeros(best.values.size)
+        aside[best.index[prior.name]] = best.size(prior.name)
+        points = [space.encode(best.values + change * aside) for change in ASIDE]
+        ends = [descend(*functions, one, space.box, ALONE, enough=1e-6) for one in points]
+        end = min(ends, key=attrgetter("cost"))
         values = space.decode(end.point)
         slopes = problem.slopes(values, names)[others]
         found = covariance(slopes, end.residual, objective.sizes, sizes)
