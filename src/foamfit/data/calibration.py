@@ -226,8 +226,6 @@ def _fitted(
     kept = test.sampled.get("displacement", np.ones(time.size, dtype=bool))
     if (outliers := test.outliers.get("displacement")) is not None:
         kept = kept & ~outliers.left_out
-    if np.count_nonzero(kept) < _FEWEST:
-        return None
     per_mass, gravity = test.specimen.area / mass, test.striker and test.striker.gravity
     lead = [0.0] * int(time[0] > 0.0)  # from time zero on, the stress rises from zero
     whole = np.append(lead, time), np.append([0.0] * len(lead), stress * per_mass)
