@@ -44,8 +44,6 @@ def robust_variance(residual: Array) -> float:
 def quantum(values: Array) -> float:
     """Return the step of the digitiser: the smallest gap between levels; 0 if not digitised."""
     levels = np.unique(values)
-    if levels.size < 2:
-        return 0.0
     gaps = np.diff(levels)
     gaps = gaps[gaps > 1e-9 * float(np.ptp(values))]
     # Digitised values have few levels. So has a motion to and fro at constant speed, but its steps
