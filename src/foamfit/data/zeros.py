@@ -89,8 +89,6 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
     """
     size = max(8, int(_TAIL * len(values)))
     step, n = max(4, size // 2), size
-    if np.argmax(values) > len(values) - 2 * size:
-        return None
     level, rows = mean_level(values[-n:], noise), np.arange(n, dtype=np.float64)
     slope = level_on_line(rows, values[-n:], 0.0, noise)[1]
     bend, error = _bend(rows, values[-n:], noise)
