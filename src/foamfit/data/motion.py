@@ -464,10 +464,6 @@ def _turns(x: Array, values: Array, modes: _Modes, bounds: tuple[float, float]) 
         # Merge the first or last stretch with its neighbour; remove any other with both its ends.
         gone = [1] if i == 0 else [at.size - 2] if i == at.size - 2 else [i, i + 1]
         at, changes = np.delete(at, gone), np.delete(changes, gone, axis=0)
-    for i in range(1, at.size - 1):  # the extremum may lie elsewhere in the merged stretch
-        part = values[at[i - 1] : at[i + 1] + 1]
-        high = values[at[i]] > values[at[i - 1]]
-        at[i] = at[i - 1] + int(np.argmax(part) if high else np.argmin(part))
     return at
 
 
