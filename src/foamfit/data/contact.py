@@ -249,8 +249,7 @@ def start_of_impact(record: Record, levels: Levels, *, late: bool = False) -> St
 def motion_leaves_rest(record: Record, levels: Levels) -> Kink | None:
     """Find where the motion of an impact leaves its rest; None if it has none."""
     w = record.displacement
-    if w is None:
-        return None
+    assert w is not None  # checked by the callers
     up = slice(int(np.argmax(w)) + 1)
     return leave_rest(record.instants[up], w[up], levels["displacement"], STILL_MOTION)
 
