@@ -21,6 +21,7 @@ _SMALLER = 0.9  # a cycle with a lower peak is reported as small
 _LOWEST = 0.02  # the lowest displacements, at which the specimen is unloaded
 # Shares of the peak stress
 _LOADED = 0.01  # more counts as load
+_REMEMBERED, _PER_CYCLE = 3, 60  # cycles before a later one, and their samples, that are kept
 _STILL_LOADED = 0.05  # from here a later cycle is reported to start under load
 _EARLY = 0.1  # the rise of a later cycle is straight up to here
 _FEWEST = 5  # least number of samples of that rise
@@ -163,8 +164,8 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     and ends where the stress returns to that level. A level clearly below zero is an offset of the
     sensor, as a foam does not pull its platen for long. If the zero was measured before contact and
     the tension is more than that of a loose specimen, it is glued: then the level is zero. The
-    strain not recovered is `origins["start_strain"]`, and `origins["rested"]` the time, s, since
-    the load of the cycle before.
+    strain not recovered is `origins["start_strain"]`. The motion `before` is kept, as a stress that
+    relaxes remembers it.
     """
     w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
     turn, end_of = cycle.turn, number if cycle.last is None else cycle.last
@@ -188,8 +189,6 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     back = np.flatnonzero(mean[turn : cycle.end] <= level)
     first, end = last + (share > 0.0), turn + int(back[0]) + 1 if back.size else cycle.end
     time = at_contact(record.instants)
-    before = int(np.flatnonzero(stress[: last + 1] > free + _STILL_LOADED * rise)[-1])
-    rested = time - float(record.instants[before])
     moment = "" if record.time is None else f" {engineering(time, 's')} in the file,"
     rises, returns = "from its level between the cycles", "to that level"
     if glued:
@@ -214,12 +213,25 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
         moved,
         interior={node: values - at_contact(values) for node, values in record.interior.items()},
         zeros={name: record.zeros[name] for name in moved.zeros.keys() & {"stress"}},
-        origins=moved.origins | {"start_strain": contact / height, "rested": rested},
+        origins=moved.origins | {"start_strain": contact / height},
+        before=_before(moved, cycles[: cycle.place], last),
         notes=(*cut_to_cycle(record, cycles, cycle).notes, *notes),
     )
     cut = moved.between(cycle.first, cycle.end, f"before cycle {number}", f"after cycle {end_of}")
     first, end = first - cycle.first, end - cycle.first
     return cut.between(first, end, "before contact starts", "after contact ends")
+
+
+def _before(record: Record, earlier: list[Cycle], last: int) -> tuple[Array, Array] | None:
+    """Return times and motion of the last cycles up to a row, with their turning points."""
+    if record.time is None:
+        return None
+    assert record.displacement is not None
+    kept = earlier[-_REMEMBERED:]
+    turns = [row for one in kept for row in (one.first, one.top)]
+    rows = np.linspace(turns[0], last, _PER_CYCLE * len(kept)).astype(int)
+    rows = np.unique([*rows, *turns])
+    return record.time[rows], record.displacement[rows]
 
 
 def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:

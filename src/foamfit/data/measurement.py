@@ -207,6 +207,7 @@ class Samples:
     derived: tuple[str, ...] = ()
     braked: bool = False
     notes: tuple[str, ...] = ()
+    before: tuple[Array, Array] | None = None  #: times (s) and motion (m) before a later cycle
 
     def curves(self, *more: str) -> dict[str, Array]:
         """Return the available ones of stress, displacement, `more`, interior displacements."""
@@ -344,7 +345,6 @@ class Measurement(Samples):
     cycles: tuple[int, ...] = (1,)  #: numbers of all cycles in the record
     last_cycle: int | None = None  #: number of the last of several used as one history
     start_strain: float = 0.0  #: not recovered before a later cycle, relative to first contact
-    rested: float | None = None  #: time since the load before a later cycle, s (or sample numbers)
     #: deceleration of the striker, m/s², only of an impact without a measured displacement
     acceleration: Array | None = None
     #: contact time by the first rise of the stress alone, s (or sample number) after time zero, and

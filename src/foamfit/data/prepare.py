@@ -210,7 +210,7 @@ def _measured(
         outliers=outliers,
         count=count_rows(whole, outliers, block),
         start_strain=origins.pop("start_strain", 0.0),
-        rested=origins.pop("rested", None),
+        before=whole.before,
         sampled=thinned.sampled,
         zeros=whole.zeros,
         origins=origins,

@@ -245,7 +245,7 @@ class Objective:
         """Return the change of the residual by each mode of what drives, (n_data, m), or None."""
         if self.scenes.smooth is None:
             return None
-        modes = self.scenes.smooth.modes(self.scenes.clock)
+        modes = self.scenes.modes(self.scenes.smooth)
         if self.drive == "stress" and (zero := self.measurement.zeros.get("stress", 0.0)):
             modes = np.column_stack((modes, np.full(len(modes), zero)))
         out = np.empty((self.n_data, modes.shape[1]))

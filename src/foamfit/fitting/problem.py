@@ -108,6 +108,9 @@ def make_params(
     _add_heights(params, measurement, model)
     late = nuisance.is_late(measurement, time_shift=time_shift)
     _add_nuisance(params, measurement, scales, drive, late)
+    if model.relaxation and measurement.before is not None and "displacement_zero" in params:
+        # A stress that relaxes may be gone above the strain at which the first contact was.
+        params["displacement_zero"].min -= measurement.start_strain * measurement.specimen.height
     for name in params:  # a fifth of the upper end, where the ends are zero and other parameters
         if name in model.index and isinstance((param := model.param(name)).coordinate, Between):
             first, last = param.coordinate.ends(*others(name, param, params.valuesdict()))

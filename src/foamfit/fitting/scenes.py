@@ -100,11 +100,12 @@ class Scenes:
         self.time = test.instants
         sampled = self.drive == "stress" and self.smooth is None
         self._fine = 1 if sampled else min(test.block, FINEST)
-        self.clock, self._own = instants(self.time, self._fine, self.averaged), None
+        self.clock = own = instants(self.time, self._fine, self.averaged)
         if self.driven:
-            own = self.clock
             self.clock = driven_instants(test, own, self.motion)
-            self._own = np.searchsorted(self.clock, own) if self.clock.size > own.size else None
+            if self._earlier and test.before is not None:
+                self.clock = np.append(test.before[0], self.clock)
+        self._own = np.searchsorted(self.clock, own) if self.clock.size > own.size else None
         driving = {"stress": ["stress_time"], "displacement": ["displacement_time"]}
         absent = driving.get(self.drive, []) + ["stress_time"] * (test.time is None)
         self.present = tuple(name for name in self.curves if name not in absent)
@@ -140,7 +141,11 @@ class Scenes:
     def _moved(self) -> Array:
         """The measured motion at the simulated instants, m."""
         assert self.measurement.displacement is not None
-        return moved_at(self.clock, self.time, self.measurement.displacement, self.motion)
+        moved = moved_at(self.clock, self.time, self.measurement.displacement, self.motion)
+        if self._earlier:
+            assert self.measurement.before is not None
+            moved[: self._earlier] = self.measurement.before[1]
+        return moved
 
     @cached_property
     def _along(self) -> dict[bool, Plan]:
@@ -154,6 +159,18 @@ class Scenes:
         channels = {channel: zero for zero, channel in nuisances.ZEROS.items()}
         zeros = {curve: channels.get(channel_of(curve), "") for curve in self.curves}
         return {curve: zero for curve, zero in zeros.items() if zero in self.nuisance}
+
+    @property
+    def _earlier(self) -> int:
+        """Number of instants before a later cycle, whose motion a stress that relaxes remembers."""
+        before = self.measurement.before
+        return before[0].size if self.driven and self.model.relaxation and before else 0
+
+    def modes(self, smooth: SmoothMotion) -> Array:
+        """Return the modes of what drives at the simulated instants, (instants, m)."""
+        modes = smooth.modes(self.clock)
+        modes[: self._earlier] = 0.0
+        return modes
 
     def moved_by(self, change: Array | float) -> Scenes:
         """Return the scenes with a changed driving motion."""
@@ -366,6 +383,9 @@ class Scenes:
                 displacement=self._sampled(motion.displacement),
                 base_stress=self._sampled(motion.base_stress),
             )
+        if self._earlier:
+            of_cycle = motion.switches[:, 0] > self.clock[self._earlier - 1]
+            motion = motion._replace(switches=motion.switches[of_cycle])
         if contact == 0.0:
             return motion
         switches = motion.switches.copy()

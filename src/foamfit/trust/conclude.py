@@ -26,7 +26,7 @@ from foamfit.parts import ParameterEstimate
 from foamfit.results import Correlation, Curves, Fit, Intervals, Switch
 from foamfit.solve.cache import SPENT
 from foamfit.springs import laws
-from foamfit.springs.parameters import any_param, family, split_name, unit_of
+from foamfit.springs.parameters import any_param, split_name, unit_of
 from foamfit.text import engineering, listed
 from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
@@ -48,7 +48,6 @@ from foamfit.trust.residuals.law_error import CurveError
 ASTRAY = 2.0
 CLOSE = 0.9  # smallest correlation that is named
 UNDER = 0.05  # share of the peak stress, above which a record ends under load
-UNRELAXED = 0.02  # share of a stress from the cycle before, from which a fit of a later one is off
 
 
 def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None = None) -> Fit:
@@ -239,23 +238,12 @@ def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict
         "stopped": not intervals.ranged,
         "vibrates": objective.interior_mass,
         "begun": model.relaxation and any(UNDER_LOAD in note for note in test.notes),
-        "unrelaxed": left if (left := _unrelaxed(best)) > UNRELAXED else 0.0,
         "ended": ended if errs and objective.drive != "impact" and ended > UNDER else 0.0,
         "lost": lost_height(best),
         "alone": errs and not (record.stopped or record.led) and 0 < record.agreeing < 2,
         "off": misfit if misfit > POOR else 0.0,
         "curve": curve,
     }
-
-
-def _unrelaxed(best: BestPoint) -> float:
-    """Return the largest share of a stress that has not relaxed since the cycle before."""
-    model, rested = best.problem.model, best.problem.measurement.rested
-    if rested is None:
-        return 0.0
-    names = [name for name in model.names if family(split_name(name)[1]) == "tau"]
-    terms = [(best.value(name.replace("_tau", "_g")), best.value(name)) for name in names]
-    return max((g * math.exp(-rested / tau) for g, tau in terms), default=0.0)
 
 
 def _estimates(

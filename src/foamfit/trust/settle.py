@@ -47,7 +47,10 @@ def held_by_record(problem: Problem, asked: Collection[str]) -> Problem:
     Those that the user has `asked` to vary stay free.
     """
     objective = problem.objective
-    shown = shown_by(problem.measurement, objective.drive, late=objective.time_shift)
+    test = problem.measurement
+    shown = shown_by(test, objective.drive, late=objective.time_shift)
+    if problem.model.relaxation and test.before is not None:  # the zero is that of the law
+        shown.pop("displacement_zero", None)
     return problem.keeping({name: one for name, one in shown.items() if name not in asked})
 
 
