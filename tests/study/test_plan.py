@@ -340,6 +340,8 @@ def test_a_slow_test_is_followed_by_cycles_and_holds(monkeypatch):
         ('[striker]\nmasses = "7 g"\n', "masses must be a list"),
         ('[limits]\nforce = "500 mm"\n', "wrong dimension"),
         ('[limits]\nstrain = "-0.2"\n', "positive"),
+        ("[limits]\nstrain = 90\n", 'strain = "90" must be between 0 and 1'),
+        ('[machine]\nstrain = "0.1 to 1.7"\n', 'between 0 and 1, like "0.1 to 0.7"'),
         ("[machine]\ncycles = 0\n", "a whole number from 1 up"),
         ("[record]\nnoise = 3\n", "noise"),
         ('[record]\nnoise = { sress = "2 Pa" }\n', "sress"),

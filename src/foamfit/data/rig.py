@@ -38,6 +38,23 @@ from foamfit.errors import InputError, naming
 from foamfit.text import engineering, listed
 
 Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Strain:
+    """Check of a strain, or of a range of strains, between 0 and 1."""
+
+    positive: Quantity
+
+    def __call__(self, value: Any, where: str) -> Any:
+        """Return the strain, or the ends of the range."""
+        found = self.positive(value, where)
+        if np.max(found) >= 1.0:
+            example = self.positive.example
+            raise InputError(f'{where} = "{value}" must be between 0 and 1, like "{example}".')
+        return found
+
+
 _RIG: dict[str, dict[str, Check]] = {
     "striker": {
         "velocity": Span("m/s", "0.5 to 6 m/s"),
@@ -45,14 +62,14 @@ _RIG: dict[str, dict[str, Check]] = {
     },
     "machine": {
         "rate": Span("1/s", "0.01 to 10 1/s"),
-        "strain": Span("", "0.1 to 0.7"),
+        "strain": Strain(Span("", "0.1 to 0.7")),
         "cycles": COUNT,
         "hold": Quantity("s", "10 s"),
     },
     "limits": {
         "force": Quantity("N", "500 N"),
         "displacement": Quantity("m", "1 mm"),
-        "strain": Quantity("", "0.9"),
+        "strain": Strain(Quantity("", "0.9")),
     },
     "record": {
         "rate": Quantity("1/s", "1 MHz"),
