@@ -291,8 +291,20 @@ def test_a_study_of_the_next_test_reads_the_tests_at_hand_as_they_were_fitted(
     assert (study.held, study.drive) == ({"s1_k0": 5.5e6}, "impact")
     second = replace(of_quantity.tests[0], cycle=2, cycles=(1, 2))
     (tmp_path / "second").mkdir()
-    replace(of_quantity, tests=(second,)).write(tmp_path / "second", pages=False)
-    assert not (tmp_path / "second/joint.toml").exists()
+    lost = replace(of_quantity.tests[0], path=tmp_path / "gone.csv")
+    for test, why in ((second, "other cycles"), (lost, "is not found at")):
+        other = replace(of_quantity, tests=(test,))
+        other.write(tmp_path / "second", pages=False)
+        assert not (tmp_path / "second/joint.toml").exists()
+        assert why in other.sentences[-1]
+
+
+def test_a_record_is_found_from_any_directory(soft, tmp_path):
+    (tmp_path / "foam.csv").touch()
+    test = replace(soft.measurement, path=Path("foam.csv"))
+    replace(soft, measurement=test).save(tmp_path / "fits/foam/bistable", report=False)
+    (found,), _ = plan_module._read([tmp_path / "fits/foam/bistable"])
+    assert found.problem.measurement.path == tmp_path / "foam.csv"
 
 
 def slow_test() -> Measurement:

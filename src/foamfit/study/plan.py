@@ -201,6 +201,7 @@ def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
         for fit in fits:
             if not isinstance(fit, FitResult):
                 raise InputError(f"{one} is not a fit or joint fit; name the folder of one")
+            fit = _with_record(fit, one) if isinstance(one, str | Path) else fit
             problem = problem_of(fit)
             found.append(Test(problem, problem.vector(fit.params) - problem.origins, fit))
     if not found:
@@ -211,6 +212,20 @@ def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
     return same, {
         rung_name(x.problem.model.name, "none", x.problem.model.relaxation): x for x in rest
     }
+
+
+def _with_record(fit: FitResult, folder: str | Path) -> FitResult:
+    """Return a fit with the path of its record as found from the folder of the result.
+
+    A result names its record as the fit was given it, relative to the current directory of that
+    time, which usually contains the folder.
+    """
+    path = fit.measurement.path
+    if path is None:
+        return fit
+    places = (place / path for place in Path(folder).resolve().parents)
+    path = next((place for place in places if place.is_file()), path)
+    return replace(fit, measurement=replace(fit.measurement, path=path))
 
 
 def _published(name: str) -> Test:

@@ -140,6 +140,8 @@ class Plan(Result, OfLaw):
         for one in self.tests:
             if one.path is None:
                 return f"{one.name} has no record"
+            if not one.path.is_file():
+                return f"the record of {one.name} is not found at {one.path}"
             if one.cycle != min(one.cycles) or one.last_cycle is not None:
                 return f"{one.name} was fitted with other cycles; a study reads the first of each"
         return ""
