@@ -128,6 +128,8 @@ def test_without_a_safe_test_none_is_advised(soft, tmp_path, monkeypatch):
     found = ff.plan(soft, rig=rig)
     assert found.advice is None
     assert found.sentences[0].startswith("Next test: none.")
+    assert all(found.now[name].state != "determined" for name in found.never)
+    assert found.never["s1_kc"] == "a rig with higher limits"
     found.save(tmp_path / "plan")
     assert not (tmp_path / "plan/next.toml").exists()
 

@@ -353,10 +353,12 @@ def _completed(stated: dict[str, dict[str, Any]], test: Measurement, relaxing: b
 
 def beyond(rig: Rig, springs: int) -> Iterator[tuple[str, Rig]]:
     """Yield more capable rigs, each with the name of what it adds."""
-    none = {"force": math.inf, "displacement": math.inf}
+    free = replace(rig, force=math.inf, displacement=math.inf)
+    if free != rig:
+        yield "a rig with higher limits", free
     if rig.masses:
         high = rig.velocity[1], 3.0 * rig.velocity[1]
-        yield "a faster or heavier striker", replace(rig, velocity=high, **none)  # type: ignore[arg-type]
+        yield "a faster or heavier striker", replace(free, velocity=high)
         if springs > 1 and not rig.interior:
             yield "the displacement of an interior mass", replace(rig, interior=True)
     if not rig.rates[0] > 0.0:
@@ -366,6 +368,6 @@ def beyond(rig: Rig, springs: int) -> Iterator[tuple[str, Rig]]:
         wide = 0.01 * rig.rates[0], 100.0 * rig.rates[1]
         yield "a wider range of strain rates", replace(rig, rates=wide)
         deep = rig.strain[1], max(rig.strain[1], 0.85)
-        yield "a larger strain", replace(rig, strain=deep, **none)  # type: ignore[arg-type]
+        yield "a larger strain", replace(free, strain=deep)
     quiet = {channel: 0.1 * sigma for channel, sigma in rig.noise.items()}
     yield "sensors with a tenth of the noise", replace(rig, noise=quiet)

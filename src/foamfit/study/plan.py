@@ -148,6 +148,7 @@ def plan(
     pair = _pair(known, outcomes, seen, safe)
     progress(0.92, "what no test of this rig determines")
     shown = {name for i in safe for name in outcomes[i].determined}
+    shown |= {name for name, one in now.items() if one.state == "determined"}
     left = [name for name in known.names if name not in shown]
     never = _beyond(known, left, limits, impacts=not contradicted)
     progress(0.97, "the velocity that closes the loop")

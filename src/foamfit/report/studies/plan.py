@@ -121,7 +121,7 @@ class Plan(Result, OfLaw):
     advice: Outcome | None  #: that of the advised test; None if none is safe
     #: the pair of tests that determines most, with what both determine
     pair: tuple[Outcome, Candidate] | None
-    never: dict[str, str]  #: parameters that no test of this rig determines, and what would
+    never: dict[str, str]  #: parameters that no single test determines, and what would
     #: by striker mass: velocities that reach every branch in half, and in 95 % of the draws
     closing: dict[float, tuple[float, float]]
     quantity: Quantity | None
