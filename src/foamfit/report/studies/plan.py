@@ -326,7 +326,7 @@ def draw_intervals(ax: Axes, plan: Plan) -> None:
             style |= {"linestyle": (0, (1, 1)) if unknown else "-"}
             ax.plot([-half, half], [i + shift] * 2, label=f"{'_' * bool(i)}{label}", **style)
     for edge in (-0.5, 0.5):
-        ax.axvline(edge, color="black", linewidth=0.5, linestyle=":")
+        ax.axvline(edge, color="black", linewidth=0.5)
     ax.set(yticks=range(len(names)), yticklabels=plan.own(names), ylim=(len(names) - 0.5, -0.5))
     ax.set_xscale("symlog", linthresh=0.1)
     ax.set(xticks=(-3, -0.5, 0, 0.5, 3), xlim=(-SHOWN, SHOWN))
