@@ -143,8 +143,8 @@ def joint(study: Path, seed: int | None, output: Output) -> int:
 
     \b
     STUDY.toml, for example:
-        name = "shoe foam, new heel"
-        tests = ["new-heel-comp-*_raw.txt"]     # files, folders, globs, relative to this file
+        name = "shoe foam"
+        tests = ["heel-*.csv"]                  # files, folders, globs, relative to this file
         specimen = "heel.toml"                  # for all tests; default: the TOML beside each
         model = "microscale"
         relaxation = 1
@@ -157,7 +157,7 @@ def joint(study: Path, seed: int | None, output: Output) -> int:
         s1_tau1 = "power rate"                  # v (rate/rate0)^b
         s1_g1 = "auto"                          # shared, own or a rate law, by evidence
         s1_eps_star = 0.3                       # fixed at a value (SI)
-    Also: seed, cycle, starts, and [specimens] with a TOML for single tests: new-heel-1 = "a.toml".
+    Also: seed, cycle, starts, and [specimens] with a TOML for single tests: heel-1 = "a.toml".
     """
     output.check(without_report=False)
     folder = output.folder(Path("fits", study.stem), "joint.json")
