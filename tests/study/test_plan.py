@@ -167,6 +167,7 @@ def test_expected_widths_are_those_of_a_joint_fit_with_the_advised_test(of_publi
         width = found.advice.expected[name].ci95_width
         assert 1 / 1.5 < (high - low) / width < 1.5, (name, high - low, width)
         assert joint.parameters[name].state == "determined"
+    assert [one.study for one in plan_module._read([joint])[0]] == ["both", "both"]
 
 
 def test_a_quantity_is_known_better_after_the_test_that_is_chosen_for_it(of_quantity):

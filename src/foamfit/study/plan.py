@@ -68,11 +68,12 @@ SPEEDS, SLOWEST, HALVINGS = 18, 40.0, 8
 
 @dataclass(frozen=True, eq=False)
 class Test:
-    """A test at hand: its problem and parameters, and its result if it was measured."""
+    """A test at hand: its problem and parameters, its result if it was measured, and its study."""
 
     problem: Problem
     values: Array
     fit: FitResult | None = None
+    study: str = ""  # name of the joint fit that it belongs to
 
 
 @single_threaded
@@ -153,6 +154,7 @@ def plan(
     never = _beyond(known, left, limits, impacts=not contradicted)
     progress(0.97, "the velocity that closes the loop")
     return Plan(
+        name=tests[0].study or test.name,
         tests=tuple(one.problem.measurement for one in tests),
         model=known.problem.model.name,
         relaxation=known.problem.model.relaxation,
@@ -198,13 +200,15 @@ def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
             found.append(_published(one))
             continue
         read = load(one) if isinstance(one, str | Path) else one
-        fits = read.results.values() if isinstance(read, JointResult) else [read]
+        fits, study = [read], ""
+        if isinstance(read, JointResult):
+            fits, study = [*read.results.values()], read.name
         for fit in fits:
             if not isinstance(fit, FitResult):
                 raise InputError(f"{one} is not a fit or joint fit; name the folder of one")
             fit = _with_record(fit, one) if isinstance(one, str | Path) else fit
             problem = problem_of(fit)
-            found.append(Test(problem, problem.vector(fit.params) - problem.origins, fit))
+            found.append(Test(problem, problem.vector(fit.params) - problem.origins, fit, study))
     if not found:
         raise InputError("name at least one result to plan from")
     first = found[0].problem.model

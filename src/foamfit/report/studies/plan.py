@@ -112,6 +112,7 @@ class Quantity:
 class Plan(Result, OfLaw):
     """The tests that a rig can make, ranked by what they would determine; SI."""
 
+    name: str  #: that of the joint fit, or of the first test at hand
     tests: tuple[Measurement, ...]  #: the tests at hand
     model: str
     relaxation: int
@@ -145,11 +146,6 @@ class Plan(Result, OfLaw):
             if one.cycle != min(one.cycles) or one.last_cycle is not None:
                 return f"{one.name} was fitted with other cycles; a study reads the first of each"
         return ""
-
-    @property
-    def name(self) -> str:
-        """Name of the first test at hand."""
-        return self.tests[0].name
 
     @property
     def sentences(self) -> tuple[str, ...]:
