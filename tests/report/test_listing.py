@@ -32,7 +32,9 @@ def test_every_result_is_one_line(folder):
     ran = run("list", str(folder))
     assert ran.exit_code == 0
     head, *lines = ran.output.split("\n\n")[0].splitlines()
-    assert head.split() == ["test", "model", "status", "options", "misfit", "determined", "when"]
+    columns = ["test", "model", "status", "options", "misfit", "determined", "when", "folder"]
+    assert head.split() == columns
+    assert sorted(line.split()[-1] for line in lines) == ["bad", "model-1/impact", "model-3/stress"]
     assert len(lines) == 3
     content = json.loads((folder / "model-1/impact/fit.json").read_text(encoding="utf-8"))
     line = next(line for line in lines if "model-1" in line)

@@ -65,7 +65,7 @@ def list_results(folder: Path, opening: bool) -> None:
     from foamfit.report.listing import lines, results_in, write_index
 
     found = results_in(folder)
-    say(lines(found))
+    say(lines(found, folder))
     page = write_index(folder, found)
     if page is not None:
         say(f"\nthe same with loops and links: {page}")
