@@ -327,8 +327,9 @@ def test_the_command_writes_card_numbers_and_picture(
     monkeypatch.chdir(tmp_path)
     done = run("card", fit, "--format", "mat083", "--rates", "0.25,10")
     assert done.exit_code == 0, done.output
-    assert "cards/a-foam-mat083.k" in done.output
-    names = ["a-foam-mat083.k", *(f"a-foam-mat083.k.{one}" for one in ("json", "pdf", "png"))]
+    card = f"{fit.parent.name}-foam-mat083.k"
+    assert f"cards/{card}" in done.output
+    names = [card, *(f"{card}.{one}" for one in ("json", "pdf", "png"))]
     assert sorted(path.name for path in Path("cards").iterdir()) == names
     told = json.loads(Path("cards", names[1]).read_text())
     assert list(told) == ["format", "misfit", "parameters", "curves", "warnings"]

@@ -258,7 +258,7 @@ def test_files_and_terminal(soft, of_quantity, tmp_path, monkeypatch):
     ran = run("plan", "fits/foam/bistable", "--for", QUANTITY)
     assert ran.exit_code == 0, ran.output
     assert "Next test: an impact of 7 g at" in ran.output
-    folder = tmp_path / "plans/foam"
+    folder = tmp_path / "plans/foam-bistable-quantity-peak_force-at-2.5-m-s"
     content = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
     assert content == json.loads(json.dumps(of_quantity.to_json_dict()))
     advice, now = content["advice"], content["now"]

@@ -133,7 +133,7 @@ def _cluster(address: str) -> Iterator[Executor]:
 @options.declared(
     "seed", default=None, help="The same tests and seed give the same numbers. Default: 0."
 )
-@options.output("fits/<STUDY>", "joint.json")
+@options.output("fits/<STUDY>; fits/<plan>-joint for the joint.toml of a plan", "joint.json")
 def joint(study: Path, seed: int | None, output: Output) -> int:
     """Fit the tests of STUDY.toml together.
 
@@ -160,7 +160,8 @@ def joint(study: Path, seed: int | None, output: Output) -> int:
     Also: seed, cycle, starts, and [specimens] with a TOML for single tests: heel-1 = "a.toml".
     """
     output.check(without_report=False)
-    folder = output.folder(Path("fits", study.stem), "joint.json")
+    name = f"{study.resolve().parent.name}-joint" if study.stem == "joint" else study.stem
+    folder = output.folder(Path("fits", name), "joint.json")
     from foamfit.study.study_file import read_study
 
     read = read_study(study)
