@@ -123,6 +123,13 @@ def test_loading_curves_are_those_of_the_law_and_fit_for_a_solver(joint: Path) -
     assert np.abs(read - law)[beyond].max() < 2e-3 * curves.stress[3].max()
 
 
+def test_curves_end_where_a_bistable_law_ends() -> None:
+    base, soft = fabricated.result(), {"s1_kc": 1e6, "s1_dsigma": -1e5}  # eps_star = -0.13
+    made = {name: fabricated.estimate(name, value) for name, value in soft.items()}
+    card = ff.card(replace(base, parameters=base.parameters | made), format="csv")
+    assert 0.8 < card.curves.strain[-1] < 0.87
+
+
 # ------------------------------------------------------------------------------- unloading
 
 
@@ -327,8 +334,9 @@ def test_the_command_writes_card_numbers_and_picture(
     monkeypatch.chdir(tmp_path)
     done = run("card", fit, "--format", "mat083", "--rates", "0.25,10")
     assert done.exit_code == 0, done.output
-    assert "cards/a-foam-mat083.k" in done.output
-    names = ["a-foam-mat083.k", *(f"a-foam-mat083.k.{one}" for one in ("json", "pdf", "png"))]
+    card = f"{fit.parent.name}-foam-mat083.k"
+    assert f"cards/{card}" in done.output
+    names = [card, *(f"{card}.{one}" for one in ("json", "pdf", "png"))]
     assert sorted(path.name for path in Path("cards").iterdir()) == names
     told = json.loads(Path("cards", names[1]).read_text())
     assert list(told) == ["format", "misfit", "parameters", "curves", "warnings"]
@@ -341,6 +349,8 @@ def test_the_command_writes_card_numbers_and_picture(
     )
     np.testing.assert_allclose(rows[:, 2], told["curves"][0]["stress"])
     assert np.all(rows[:, 3] == (rows[:, 1] > TOP))
+    Path("mine.k").write_text("mine")
+    assert "is not a card" in run_refused("card", fit, "--format", "csv", "--out", "mine.k")
 
 
 @pytest.mark.parametrize(

@@ -355,6 +355,7 @@ def test_init_asks_what_the_file_does_not_say(
         (["--fix", "s1_k9=1"], ("'s1_k9'", "s1_k0")),
         (["--fix", "s1_k0"], ("'s1_k0'", "NAME=VALUE")),
         (["--fix", "s1_k0=nan"], ("'s1_k0=nan'", "NAME=VALUE")),
+        (["--fix", "s1_k0=5e6", "--fix", "s1_k0=6e6"], ("'s1_k0' is given twice",)),
         (["--vary", "s2_eta"], ("'s2_eta'", "s1_eta")),
         (["--fix", "s1_eta=0", "--vary", "s1_eta"], ("'s1_eta'", "both fixed and varied")),
         (["--model", "linear+bistable", "--fix", "s2_height=1e-3"], ("s2_height", "s1_height")),

@@ -13,6 +13,7 @@ from click.testing import Result
 import fabricated
 import foamfit as ff
 from conftest import run, run_refused, without_pictures, write_csv
+from foamfit.cli.results import _named
 
 TOML = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\nmass = "1 g"\n'
 FAST = ("--model", "linear", "--quiet", "--no-report")
@@ -95,6 +96,13 @@ def test_the_name_has_the_model_and_every_option_that_changes_the_numbers(
     here.with_name("other.toml").write_text(TOML)
     monkeypatch.setattr("foamfit.api.fit", lambda *_, **__: fabricated.result())
     assert fitted(*options.split()) == [f"fits/foam/{name}"]
+
+
+def test_what_is_made_of_a_result_is_named_after_its_place() -> None:
+    assert _named("fits/foam/bistable", cycle=2, drive=None) == "foam-bistable-cycle-2"
+    assert _named("runs/foam", "foam-1/model-2", rig="slow") == "runs-foam+foam-1-model-2-rig-slow"
+    Path("fits").touch()
+    assert "fits/foam-joint cannot" in run_refused("joint", "plans/foam/joint.toml")
 
 
 def test_other_options_and_cycles_get_folders_of_their_own() -> None:

@@ -83,12 +83,19 @@ def test_rows_without_a_force_and_a_motion_are_counted(
     assert (item.rows, item.why) == (unused, "no numbers in the columns in use")
 
 
+def test_a_result_below_the_table_is_a_remark(tmp_path: Path) -> None:
+    rows = [f"{t},\u2212{f},\u2212{w}" for t, f, w in zip(T, F, W, strict=True)]  # minus signs
+    (item,) = read_test(write_lines(tmp_path, [PLAIN, *rows, "Max force,200,N"])).rows.dropped
+    assert (item.rows, item.first, item.why) == (1, T.size + 2, "a remark below the table")
+
+
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
         (["0 s,0 N,0 mm", *ROWS[1:]], "row 2, column 'time (s)' is '0 s'"),
         (["N/A,N/A,1", *ROWS[1:]], "row 2, column 'time (s)' is 'N/A'"),
         ([*ROWS[:30], "here,the,force", *ROWS[30:]], "row 32, column 'time (s)' is 'here'"),
+        ([*ROWS[:30], "Max force,200,N", *ROWS[30:]], "row 32, column 'time (s)' is 'Max force'"),
         ([*ROWS, "max,200,4"], "row 203, column 'time (s)' is 'max'"),
         ([*ROWS[:30], "1.5,,1", *ROWS[31:]], "row 32, column 'force (N)' is empty"),
         ([f"{t},NaN,{w}" for t, w in zip(T, W, strict=True)], "row 2, column 'force (N)' is 'NaN'"),

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import foamfit as ff
-from conftest import synthetic_impact, write_measurement
+from conftest import run_refused, synthetic_impact, write_measurement
 
 OPTIONS = {"model": "bistable", "starts": 2, "intervals": "local"}
 
@@ -75,6 +75,9 @@ def test_the_toml_may_have_priors(impact: ff.Measurement, tmp_path: Path) -> Non
     study.write_text('name = "x"\ntests = ["*.csv"]\nmodel = "bistable"\n')
     with pytest.raises(ff.InputError, match=r"a joint fit accepts no \[priors\]"):
         ff.joint(study)
+    for prior in ("s1_k0 = '4 MPa'", "s1_k0 = '4 ± 1 mm'", "s1_stifness = '4 ± 1 MPa'"):
+        write_measurement(path, impact, f"[priors]\n{prior}\n")
+        assert prior.split()[0] in run_refused("check", path)
     write_measurement(path, impact, "[priors]\ns1_k0 = 4e6\n")
     with pytest.raises(ff.InputError, match=r"\[priors\] s1_k0 = 4000000.0 must be like "):
         ff.read_test(path)

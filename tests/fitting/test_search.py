@@ -34,6 +34,7 @@ def test_an_impact_is_recovered_within_three_standard_errors():
         assert abs(item.value - true) <= 3 * item.stderr, name
         assert item.state in ("determined", "weak")
     assert impact_fit.statistics["redchi"] == pytest.approx(1.0, abs=0.15)
+    assert 1 < impact_fit.statistics["n_agreeing"] <= impact_fit.statistics["n_descents"]
     assert impact_fit.status in ("ok", "warnings")
     assert impact_fit.visited == {"s1": ("a", "d", "c", "e")}
 

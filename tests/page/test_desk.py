@@ -129,6 +129,11 @@ def test_what_is_too_large_or_no_table_is_refused(desk, monkeypatch):
     with pytest.raises(InputError, match=r"picture\.png is not a table"):
         desk.receive("picture.png", b"\x89PNG")
     assert desk.csv is None
+    desk.receive("folder/a Größe.csv", b"1,2\n")
+    with pytest.raises(InputError, match=r"^a Größe\.csv: "):  # as the user calls it
+        desk.check(GOOD, "")
+    desk.worker = SimpleNamespace(job=SimpleNamespace(arguments=[]), end=lambda: None)
+    assert desk.command == "foamfit fit 'a Größe.csv' --specimen test.toml"
 
 
 @pytest.mark.parametrize("order", [("a.csv", "a.toml"), ("a.toml", "a.csv")])

@@ -156,3 +156,9 @@ def test_what_is_printed_is_narrow_and_a_fit_is_one_screen(name: str) -> None:
     assert max(map(len, lines)) <= (80 if screen else 100)
     assert len(lines) <= 22 or not screen  # the real command adds two lines on the result folder
     assert not re.search(r"\de\+\d", "".join(lines))
+
+
+def test_a_parameter_that_others_give_is_not_called_fixed() -> None:
+    made, tied = fabricated.chain_result(), {"state": "fixed", "why": "tied by 0.0119 - s1_height"}
+    made.parameters["s2_height"] = fabricated.estimate("s2_height", 6.86e-3, **tied)
+    assert "fixed: s2_eta 0 Pa·s; tied: s2_height 6.860 mm\n" in summary_text(made)

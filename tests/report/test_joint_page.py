@@ -95,6 +95,8 @@ def test_the_page_has_every_parameter_and_test(found, page):
     assert re.search(rf'data-v="{value / 1e3:.0f}(\.\d)?">', body)
     assert re.search(r"b = 0\.0\d+ \(0\.0\d+ to 0\.0\d+\)", page)
     assert page.count("<td>log rate</td>") == 2  # in the parameter and evidence tables
+    for line in found.text().splitlines()[3:8]:  # the terminal rounds as the page does
+        assert [end for end in re.findall(r"\S+ to \S+", line) if end not in page] == []
 
 
 def test_the_picture_has_the_loops_and_the_law_of_rate(found):

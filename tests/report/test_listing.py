@@ -22,6 +22,7 @@ def folder(tmp_path):
     head = "measured stress (Pa),measured displacement (m),stress along measured displacement (Pa)"
     rows = "\n".join(f"{k * 1e3},{k * 1e-6},{k * 1.1e3}" for k in range(100))
     (tmp_path / "runs/model-1/impact/curves.csv").write_text(f"{head}\n{rows}\n")
+    (tmp_path / "runs/model-3/stress/curves.csv").write_text(f"{head}\n1.0,2")  # cut short
     (tmp_path / "runs/model-1/impact/report.html").write_text("report")
     (tmp_path / "runs/bad").mkdir()
     (tmp_path / "runs/bad/fit.json").write_text('{"schema": 1, "foamfit": "0"}')
@@ -32,7 +33,9 @@ def test_every_result_is_one_line(folder):
     ran = run("list", str(folder))
     assert ran.exit_code == 0
     head, *lines = ran.output.split("\n\n")[0].splitlines()
-    assert head.split() == ["test", "model", "status", "options", "misfit", "determined", "when"]
+    columns = ["test", "model", "status", "options", "misfit", "determined", "when", "folder"]
+    assert head.split() == columns
+    assert sorted(line.split()[-1] for line in lines) == ["bad", "model-1/impact", "model-3/stress"]
     assert len(lines) == 3
     content = json.loads((folder / "model-1/impact/fit.json").read_text(encoding="utf-8"))
     line = next(line for line in lines if "model-1" in line)
@@ -42,6 +45,8 @@ def test_every_result_is_one_line(folder):
     number = sum(p["state"] == "determined" for p in own)
     assert re.search(rf"bistable\s+ok\s.*{number} of {len(own)}\s", line)
     assert "damaged" in next(line for line in lines if line.startswith("bad"))
+    (folder / "bad/fit.json").write_text(json.dumps(content | {"misfit": 3}))
+    assert "fit.json is damaged" in run("list", str(folder)).output
 
 
 def test_the_page_links_to_the_reports_and_draws_the_loops(folder):

@@ -41,6 +41,10 @@ def test_each_cycle_is_fitted_from_its_own_contact(found):
         assert result.measurement.start_strain == pytest.approx(gone, abs=1e-3)
         assert result.params["s1_eps_a"].value == pytest.approx(onset, abs=2e-3)
         assert result.misfit["stress_strain"] < 0.01
+    # Up to the limit all loops are drawn.
+    several = replace(found, results=dict.fromkeys(range(1, 9), found.results[1]))
+    lines = [line for ax in cycles_report.plot_cycles(several).axes for line in ax.lines]
+    assert sum(line.get_label() == "_measured" for line in lines) == 8
 
 
 def test_a_cycle_that_is_not_there_is_a_row_with_its_sentence(found):

@@ -93,6 +93,7 @@ def test_published_foam_1_closes_its_loop_at_the_velocity_of_the_energy_balance(
     opened = {name for name, one in found.now.items() if one.state == "not determined"}
     assert opened == {"s1_kc", "s1_dsigma", "s1_eps_c", "s1_kh_minus"}
     assert opened < set(found.advice.determined)
+    assert all("s1_eta" not in one.determined for one in found.outcomes)  # it may be zero
 
 
 def test_a_soft_hit_is_followed_by_one_that_probably_closes_the_loop(planned):
@@ -128,6 +129,8 @@ def test_without_a_safe_test_none_is_advised(soft, tmp_path, monkeypatch):
     found = ff.plan(soft, rig=rig)
     assert found.advice is None
     assert found.sentences[0].startswith("Next test: none.")
+    assert all(found.now[name].state != "determined" for name in found.never)
+    assert found.never["s1_kc"] == "a rig with higher limits"
     found.save(tmp_path / "plan")
     assert not (tmp_path / "plan/next.toml").exists()
 
@@ -165,6 +168,7 @@ def test_expected_widths_are_those_of_a_joint_fit_with_the_advised_test(of_publi
         width = found.advice.expected[name].ci95_width
         assert 1 / 1.5 < (high - low) / width < 1.5, (name, high - low, width)
         assert joint.parameters[name].state == "determined"
+    assert [one.study for one in plan_module._read([joint])[0]] == ["both", "both"]
 
 
 def test_a_quantity_is_known_better_after_the_test_that_is_chosen_for_it(of_quantity):
@@ -255,7 +259,7 @@ def test_files_and_terminal(soft, of_quantity, tmp_path, monkeypatch):
     ran = run("plan", "fits/foam/bistable", "--for", QUANTITY)
     assert ran.exit_code == 0, ran.output
     assert "Next test: an impact of 7 g at" in ran.output
-    folder = tmp_path / "plans/foam"
+    folder = tmp_path / "plans/foam-bistable-quantity-peak_force-at-2.5-m-s"
     content = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
     assert content == json.loads(json.dumps(of_quantity.to_json_dict()))
     advice, now = content["advice"], content["now"]
@@ -291,8 +295,20 @@ def test_a_study_of_the_next_test_reads_the_tests_at_hand_as_they_were_fitted(
     assert (study.held, study.drive) == ({"s1_k0": 5.5e6}, "impact")
     second = replace(of_quantity.tests[0], cycle=2, cycles=(1, 2))
     (tmp_path / "second").mkdir()
-    replace(of_quantity, tests=(second,)).write(tmp_path / "second", pages=False)
-    assert not (tmp_path / "second/joint.toml").exists()
+    lost = replace(of_quantity.tests[0], path=tmp_path / "gone.csv")
+    for test, why in ((second, "other cycles"), (lost, "is not found at")):
+        other = replace(of_quantity, tests=(test,))
+        other.write(tmp_path / "second", pages=False)
+        assert not (tmp_path / "second/joint.toml").exists()
+        assert why in other.sentences[-1]
+
+
+def test_a_record_is_found_from_any_directory(soft, tmp_path):
+    (tmp_path / "foam.csv").touch()
+    test = replace(soft.measurement, path=Path("foam.csv"))
+    replace(soft, measurement=test).save(tmp_path / "fits/foam/bistable", report=False)
+    (found,), _ = plan_module._read([tmp_path / "fits/foam/bistable"])
+    assert found.problem.measurement.path == tmp_path / "foam.csv"
 
 
 def slow_test() -> Measurement:
@@ -340,6 +356,8 @@ def test_a_slow_test_is_followed_by_cycles_and_holds(monkeypatch):
         ('[striker]\nmasses = "7 g"\n', "masses must be a list"),
         ('[limits]\nforce = "500 mm"\n', "wrong dimension"),
         ('[limits]\nstrain = "-0.2"\n', "positive"),
+        ("[limits]\nstrain = 90\n", 'strain = "90" must be between 0 and 1'),
+        ('[machine]\nstrain = "0.1 to 1.7"\n', 'between 0 and 1, like "0.1 to 0.7"'),
         ("[machine]\ncycles = 0\n", "a whole number from 1 up"),
         ("[record]\nnoise = 3\n", "noise"),
         ('[record]\nnoise = { sress = "2 Pa" }\n', "sress"),

@@ -544,7 +544,7 @@ def test_the_command_writes_a_folder_whole(tmp_path, monkeypatch, record, result
     done = run("predict", result, record, "--draws", DRAWS)
     assert (done.exit_code, done.stderr) == (0, "")
     assert "inside the 95 % band" in done.stdout
-    folder = tmp_path / "predictions" / "other"
+    folder = tmp_path / "predictions/other" / f"{tmp_path.name}-result"
     assert {path.name for path in folder.iterdir()} == {
         f"prediction.{form}" for form in ("json", "csv", "png", "pdf")
     }

@@ -133,7 +133,7 @@ def _cluster(address: str) -> Iterator[Executor]:
 @options.declared(
     "seed", default=None, help="The same tests and seed give the same numbers. Default: 0."
 )
-@options.output("fits/<STUDY>", "joint.json")
+@options.output("fits/<STUDY>; fits/<plan>-joint for the joint.toml of a plan", "joint.json")
 def joint(study: Path, seed: int | None, output: Output) -> int:
     """Fit the tests of STUDY.toml together.
 
@@ -143,8 +143,8 @@ def joint(study: Path, seed: int | None, output: Output) -> int:
 
     \b
     STUDY.toml, for example:
-        name = "shoe foam, new heel"
-        tests = ["new-heel-comp-*_raw.txt"]     # files, folders, globs, relative to this file
+        name = "shoe foam"
+        tests = ["heel-*.csv"]                  # files, folders, globs, relative to this file
         specimen = "heel.toml"                  # for all tests; default: the TOML beside each
         model = "microscale"
         relaxation = 1
@@ -157,10 +157,11 @@ def joint(study: Path, seed: int | None, output: Output) -> int:
         s1_tau1 = "power rate"                  # v (rate/rate0)^b
         s1_g1 = "auto"                          # shared, own or a rate law, by evidence
         s1_eps_star = 0.3                       # fixed at a value (SI)
-    Also: seed, cycle, starts, and [specimens] with a TOML for single tests: new-heel-1 = "a.toml".
+    Also: seed, cycle, starts, and [specimens] with a TOML for single tests: heel-1 = "a.toml".
     """
     output.check(without_report=False)
-    folder = output.folder(Path("fits", study.stem), "joint.json")
+    name = f"{study.resolve().parent.name}-joint" if study.stem == "joint" else study.stem
+    folder = output.folder(Path("fits", name), "joint.json")
     from foamfit.study.study_file import read_study
 
     read = read_study(study)

@@ -78,6 +78,8 @@ def _fixes(
     fixed = {}
     for text in values:
         name, _, number = text.partition("=")
+        if name.strip() in fixed:
+            raise click.BadParameter(f"'{name.strip()}' is given twice; fix it at one value.")
         try:
             fixed[name.strip()] = value = float(number)
         except ValueError:

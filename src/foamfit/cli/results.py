@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
 import click
 
 from foamfit.cli import options
+from foamfit.cli.fit import folder_name
 from foamfit.cli.group import main
 from foamfit.cli.options import Output
 from foamfit.cli.progress import progress_line
 from foamfit.errors import InputError
 from foamfit.terminal import say
+
+
+def _named(*results: str | Path, **given: Any) -> str:
+    """Return a name from the places of results below fits/, and from the options given.
+
+    It is foam-bistable-cycle-2 for fits/foam/bistable and cycle 2. Of a result elsewhere it has the
+    last two folders.
+    """
+    names = list[str]()
+    for one in results:
+        place = Path(one).resolve()
+        *above, last = (place.parent if place.is_file() else place).parts
+        below = len(above) - above[::-1].index("fits") if "fits" in above else -1
+        names.append("-".join([*above[below:], last]))
+    asked = {name: value for name, value in given.items() if value is not None}
+    return folder_name({"model": "+".join(names), **asked})
 
 
 @main.command()
@@ -65,7 +81,7 @@ def list_results(folder: Path, opening: bool) -> None:
     from foamfit.report.listing import lines, results_in, write_index
 
     found = results_in(folder)
-    say(lines(found))
+    say(lines(found, folder))
     page = write_index(folder, found)
     if page is not None:
         say(f"\nthe same with loops and links: {page}")
@@ -105,7 +121,7 @@ def published() -> None:
     metavar="N",
 )
 @options.declared("seed", help="The same result, test and seed give the same numbers.")
-@options.output("predictions/<test>", "prediction.json")
+@options.output("predictions/<test>/<result and options>", "prediction.json")
 def predict(
     result: Path,
     test: Path,
@@ -133,7 +149,10 @@ def predict(
     from foamfit.data.toml_file import toml_beside
     from foamfit.study.identified import read_source
 
-    folder = output.folder(Path("predictions", toml_beside(test).stem), "prediction.json")
+    given: dict[str, Any] = {"cycle": cycle, "cycles": cycles and "-".join(map(str, cycles))}
+    given |= {"drive": asked["drive"], "specimen": specimen and specimen.stem}
+    name = _named(result, **given)
+    folder = output.folder(Path("predictions", toml_beside(test).stem, name), "prediction.json")
     read_source(result)  # report a wrong path before anything is compiled
     measurement = read_test(test, specimen, cycle, cycles=cycles)
     from foamfit.study import predict as study
@@ -154,7 +173,7 @@ def predict(
     metavar='"peak_force at 3 m/s"',
 )
 @options.declared("seed", help="The same results, rig and seed give the same numbers.")
-@options.output("plans/<test>", "plan.json")
+@options.output("plans/<results and options>", "plan.json")
 def plan(
     results: tuple[str, ...], rig: Path | None, quantity: str | None, seed: int, output: Output
 ) -> None:
@@ -173,11 +192,8 @@ def plan(
         foamfit plan foam-1/model-2
     """
     output.check(without_report=False)
-    place = Path(results[0]).resolve()
-    by_test = place.parent.parent.name == "fits"  # fits/<test>/<model>
-    own = place.parent.name if by_test else place.name
-    default = own if place.is_dir() else results[0].replace("/", "-")
-    folder = output.folder(Path("plans", default), "plan.json")
+    name = _named(*results, rig=rig and rig.stem, quantity=quantity)
+    folder = output.folder(Path("plans", name), "plan.json")
     from foamfit.study import plan as study
 
     options.compile_solver(output.silent)
@@ -205,7 +221,7 @@ def plan(
 )
 @options.option(
     "--out",
-    "Card file. Default: cards/<test>-<format> with the extension of the format.",
+    "Card file. Default: cards/<result>-<format> with the extension of the format.",
     options.FILE,
 )
 def card(result: Path, format: str, units: str, rates: str | None, out: Path | None) -> None:
@@ -228,8 +244,7 @@ def card(result: Path, format: str, units: str, rates: str | None, out: Path | N
     asked = None if rates is None else rates.split(",")
     cards.check(format, units, asked)
     source = read_source(result)
-    name = re.sub(r"[^\w.+-]+", "-", source.name).strip("-.") or "card"
-    file = out or Path("cards", f"{name}-{format}{cards.FORMATS[format][0]}")
+    file = out or Path("cards", f"{_named(result)}-{format}{cards.FORMATS[format][0]}")
     folder = result if result.is_dir() else result.parent
     if folder.resolve() in file.resolve().parents:
         raise InputError(

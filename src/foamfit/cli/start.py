@@ -29,6 +29,11 @@ def check(test: Path, specimen: Path | None) -> None:
     from foamfit.report.described import describe
 
     measurement = read_test(test, specimen)
+    if measurement.priors:
+        from foamfit.fitting.problem import prior_of
+
+        for name, value in measurement.priors.items():
+            prior_of(name, value)  # refuses what no fit accepts
     say(describe(measurement, audit(measurement)))
 
 

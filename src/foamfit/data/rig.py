@@ -38,6 +38,23 @@ from foamfit.errors import InputError, naming
 from foamfit.text import engineering, listed
 
 Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Strain:
+    """Check of a strain, or of a range of strains, between 0 and 1."""
+
+    positive: Quantity
+
+    def __call__(self, value: Any, where: str) -> Any:
+        """Return the strain, or the ends of the range."""
+        found = self.positive(value, where)
+        if np.max(found) >= 1.0:
+            example = self.positive.example
+            raise InputError(f'{where} = "{value}" must be between 0 and 1, like "{example}".')
+        return found
+
+
 _RIG: dict[str, dict[str, Check]] = {
     "striker": {
         "velocity": Span("m/s", "0.5 to 6 m/s"),
@@ -45,14 +62,14 @@ _RIG: dict[str, dict[str, Check]] = {
     },
     "machine": {
         "rate": Span("1/s", "0.01 to 10 1/s"),
-        "strain": Span("", "0.1 to 0.7"),
+        "strain": Strain(Span("", "0.1 to 0.7")),
         "cycles": COUNT,
         "hold": Quantity("s", "10 s"),
     },
     "limits": {
         "force": Quantity("N", "500 N"),
         "displacement": Quantity("m", "1 mm"),
-        "strain": Quantity("", "0.9"),
+        "strain": Strain(Quantity("", "0.9")),
     },
     "record": {
         "rate": Quantity("1/s", "1 MHz"),
@@ -336,10 +353,12 @@ def _completed(stated: dict[str, dict[str, Any]], test: Measurement, relaxing: b
 
 def beyond(rig: Rig, springs: int) -> Iterator[tuple[str, Rig]]:
     """Yield more capable rigs, each with the name of what it adds."""
-    none = {"force": math.inf, "displacement": math.inf}
+    free = replace(rig, force=math.inf, displacement=math.inf)
+    if free != rig:
+        yield "a rig with higher limits", free
     if rig.masses:
         high = rig.velocity[1], 3.0 * rig.velocity[1]
-        yield "a faster or heavier striker", replace(rig, velocity=high, **none)  # type: ignore[arg-type]
+        yield "a faster or heavier striker", replace(free, velocity=high)
         if springs > 1 and not rig.interior:
             yield "the displacement of an interior mass", replace(rig, interior=True)
     if not rig.rates[0] > 0.0:
@@ -349,6 +368,6 @@ def beyond(rig: Rig, springs: int) -> Iterator[tuple[str, Rig]]:
         wide = 0.01 * rig.rates[0], 100.0 * rig.rates[1]
         yield "a wider range of strain rates", replace(rig, rates=wide)
         deep = rig.strain[1], max(rig.strain[1], 0.85)
-        yield "a larger strain", replace(rig, strain=deep, **none)  # type: ignore[arg-type]
+        yield "a larger strain", replace(free, strain=deep)
     quiet = {channel: 0.1 * sigma for channel, sigma in rig.noise.items()}
     yield "sensors with a tenth of the noise", replace(rig, noise=quiet)

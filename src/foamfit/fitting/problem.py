@@ -28,7 +28,7 @@ from foamfit.fitting.curves import (
 from foamfit.fitting.objective import Objective
 from foamfit.springs.laws.record import ADMISSIBLE, Between
 from foamfit.springs.model import Model, with_options
-from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
+from foamfit.springs.parameters import NUISANCE, any_param, split_name
 
 # Why some parameters exist in the impact drive only.
 _MOVED = "a given motion needs no striker; choose the impact drive"
@@ -407,18 +407,27 @@ def _check_strain(params: lmfit.Parameters, measurement: Measurement) -> None:
 
 
 def _prior(name: str, value: object, model: Model) -> nuisance.Prior:
-    """Read a prior of a spring parameter: mean and standard deviation, or a text."""
+    """Read a prior of a parameter of a model."""
+    if name not in (*NUISANCE, *model.names):
+        raise InputError(
+            f"priors: {name} is not one of the model {model.name}; its parameters are "
+            f"{', '.join(model.names)}"
+        )
+    return prior_of(name, value)
+
+
+def prior_of(name: str, value: object) -> nuisance.Prior:
+    """Read a prior of a spring parameter of any law: mean and standard deviation, or a text."""
     where = f"priors: {name}"
     if name in NUISANCE:
         raise InputError(
             f"{where} is not a parameter of the springs; if the TOML has it, give its ± there"
         )
-    if name not in model.names:
-        raise InputError(
-            f"{where} is not one of the model {model.name}; its parameters are "
-            f"{', '.join(model.names)}"
-        )
-    unit = unit_of(name)
+    try:
+        param = any_param(split_name(name)[1])
+    except StopIteration:
+        raise InputError(f"{where} is not a parameter of any law") from None
+    unit = param.unit
     example = "5.5 ± 0.1 MPa" if unit == "Pa" else f"0.2 ± 0.01 {unit}".rstrip()
     if isinstance(value, str):
         mean, sigma = parse_uncertain(value, unit or "", where, example, zero=True)
@@ -433,7 +442,7 @@ def _prior(name: str, value: object, model: Model) -> nuisance.Prior:
             f"{where} = {value!r} must be a mean and a positive standard deviation {pair}, or a "
             f'text like "{example}"'
         )
-    if not ADMISSIBLE[wanted := any_param(split_name(name)[1]).admissible](mean):
+    if not ADMISSIBLE[wanted := param.admissible](mean):
         raise InputError(f"{where} = {value!r} is not admissible: its mean must be {wanted}")
     return nuisance.Prior(name, mean, sigma)
 

@@ -103,6 +103,11 @@ class SearchRecord:
     led: bool = False  # Whether it began from the minima of a poorer model, with fewer starts
 
     @property
+    def descents(self) -> int:
+        """Number of descents."""
+        return sum(count for _, count in self.costs)
+
+    @property
     def agreeing(self) -> int:
         """Number of descents that led to the best cost, within 2 %."""
         return sum(count for cost, count in self.costs if cost <= 1.02 * self.costs[0][0])

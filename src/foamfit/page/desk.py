@@ -34,6 +34,7 @@ from foamfit.report import figures
 from foamfit.report.described import describe
 from foamfit.report.panels import Line, Panel, draw
 from foamfit.study.study_file import ENDINGS
+from foamfit.terminal import printable
 from foamfit.text import listed
 
 LARGEST = 64 * 1024 * 1024  # bytes of the largest file that can be dropped
@@ -61,6 +62,7 @@ class Desk:
         self.folder = folder
         folder.mkdir(mode=0o700, exist_ok=True)
         self.csv: Path | None = None
+        self.given = ""  # name of the file as the user gave it
         self.dropped: bytes | None = None  # a TOML that has not been read yet
         self.replaced = False  # whether the file has replaced another and has not been read yet
         # Times at which a table arrived, and a TOML that came before its table.
@@ -78,16 +80,16 @@ class Desk:
     # ------------------------------------------------------------------------------- files
 
     def receive(self, name: str, content: bytes) -> str:
-        """Store a dropped file under a safe name, and return the name.
+        """Store a dropped file under a safe name, and return its own name.
 
         Raises InputError if the file is too large or not a table.
         """
         if self.running:
             raise InputError(BUSY)
-        name = safe_name(name)
+        given, name = printable(name.replace("\\", "/").rsplit("/", 1)[-1]), safe_name(name)
         if len(content) > LARGEST:
             raise InputError(
-                f"{name} is larger than {LARGEST // 2**20} MB, the limit of the page; "
+                f"{given} is larger than {LARGEST // 2**20} MB, the limit of the page; "
                 "use foamfit fit in a terminal."
             )
         suffix = Path(name).suffix.lower()
@@ -95,19 +97,19 @@ class Desk:
         if suffix == ".toml":
             self.dropped = content
             self._ahead = now if now - self._came > TOGETHER else -math.inf
-            return name
+            return given
         if suffix not in ENDINGS:
             raise InputError(
-                f"{name} is not a table; drop a file that ends in {listed(ENDINGS)}, or a TOML."
+                f"{given} is not a table; drop a file that ends in {listed(ENDINGS)}, or a TOML."
             )
         place = self.folder / "test"
         shutil.rmtree(place, ignore_errors=True)
         place.mkdir()
         self.replaced = self.csv is not None and now - self._ahead > TOGETHER
         self._came, self._ahead = now, -math.inf
-        self.csv, self.measurement, self.worker = place / name, None, None
+        self.csv, self.given, self.measurement, self.worker = place / name, given, None, None
         self.csv.write_bytes(content)
-        return name
+        return given
 
     def take(self, csv: Path) -> None:
         """Copy a test from this machine, with its TOML, into the folder of the window.
@@ -154,7 +156,7 @@ class Desk:
             first = next(iter(wanted), None) if isinstance(wanted, tuple) else wanted
             measurement = read_test(self.csv, toml, first, cycles=asked["cycles"])
             # The folder of the window means nothing to a user.
-            text = describe(replace(measurement, path=Path(self.csv.name)), audit(measurement))
+            text = describe(replace(measurement, path=Path(self.given)), audit(measurement))
         except InputError as error:
             raise InputError(self._plain(str(error))) from None
         self.measurement = measurement
@@ -175,10 +177,10 @@ class Desk:
         return b"" if self.csv is None else self.csv.with_suffix(".toml").read_bytes()
 
     def _plain(self, text: str) -> str:
-        """Remove the path of the window's folder from a message."""
+        """Return a message with the user's name of the file, without the folder of the window."""
         for folder in (self.folder / "test", self.folder):
             text = text.replace(f"{folder}/", "").replace(f"{folder}\\", "")
-        return text
+        return text if self.csv is None else text.replace(self.csv.name, self.given)
 
     # ------------------------------------------------------------------------------- the fit
 
@@ -225,9 +227,8 @@ class Desk:
     @property
     def command(self) -> str:
         """The command that repeats the last fit in a terminal, with the saved TOML."""
-        assert self.csv is not None
         assert self.worker is not None
-        files = self.csv.name, "--specimen", SAVED_TOML
+        files = self.given, "--specimen", SAVED_TOML
         return shlex.join(["foamfit", "fit", *files, *self.worker.job.arguments])
 
     def zipped(self) -> bytes:

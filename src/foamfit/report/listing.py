@@ -47,7 +47,7 @@ PAGE, MARK = "index.html", b'<meta name="generator" content="foamfit list">'
 LONGEST = 36  # characters of the name of a test in the terminal
 POINTS = 60  # of each curve of a small loop
 WIDE, TALL = 88, 56  # of a small loop, pixels
-HEAD = ["test", "model", "status", "options", "misfit", "determined", "when"]
+HEAD = ["test", "model", "status", "options", "misfit", "determined", "when", "folder"]
 STRAIN, STRESS = "measured displacement (m)", "measured stress (Pa)"
 FITTED = "stress along measured displacement (Pa)"
 
@@ -103,9 +103,9 @@ class Row:
         return [tail(self.test, LONGEST), self.model, self.status, *rest, self.date]
 
 
-def lines(results: Sequence[Row]) -> str:
-    """Return a line for each result, below a head."""
-    rows = [HEAD, *(one.cells for one in results)]
+def lines(results: Sequence[Row], top: Path) -> str:
+    """Return a line for each result in the folder `top`, below a head."""
+    rows = [HEAD, *([*one.cells, str(one.place.relative_to(top))] for one in results)]
     wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(row, wide, strict=True)).rstrip()

@@ -72,6 +72,11 @@ class Readable:
         return f"{number} {self.unit}".removesuffix(" –") if number else ""
 
     @property
+    def tied(self) -> bool:
+        """Whether an expression of other parameters gives the value."""
+        return self.state == "fixed" and self.why.startswith("tied by")
+
+    @property
     def matters(self) -> bool:
         """Whether the reason is worth showing: not determined, or a remark after a semicolon."""
         return self.state != "fixed" and (self.state != "determined" or ";" in self.why)

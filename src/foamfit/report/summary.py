@@ -48,7 +48,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
         "m": measured,
         "ladder": ladder,
         "shown": [(name, percent(misfit)) for name, misfit in compared(result).items()],
-        "fixed": [f"{row.name} {row.value} {row.unit}" for row in rows if row.state == "fixed"],
+        "fixed": [row for row in rows if row.state == "fixed"],
         "determined": determined(result),
         "unknown": _unknown({n: p for n, p in result.parameters.items() if n not in NUISANCE}),
         "remedies": [one.lines[0] for one in result.contradictions if one.lines],

@@ -146,7 +146,7 @@ class JointResult(Result, OfLaw):
         known = [one.misfit for one in self.tests.values()]
         curves = [n for n in MISFITS if any(misfit.get(n) is not None for misfit in known)]
         more: Any = {"parameters": every, "nuisance": NUISANCE, "between": _between}
-        return words("joint", found=self, most=MOST_ROWS, curves=curves, **more)
+        return words("joint", found=self, most=MOST_ROWS, curves=curves, readable=readable, **more)
 
     def write(self, folder: Path, *, pages: bool = True, width: str = TWO) -> None:
         """Write joint.json, its page, its figure, table.tex, and a result folder per test."""

@@ -68,11 +68,12 @@ SPEEDS, SLOWEST, HALVINGS = 18, 40.0, 8
 
 @dataclass(frozen=True, eq=False)
 class Test:
-    """A test at hand: its problem and parameters, and its result if it was measured."""
+    """A test at hand: its problem and parameters, its result if it was measured, and its study."""
 
     problem: Problem
     values: Array
     fit: FitResult | None = None
+    study: str = ""  # name of the joint fit that it belongs to
 
 
 @single_threaded
@@ -148,10 +149,12 @@ def plan(
     pair = _pair(known, outcomes, seen, safe)
     progress(0.92, "what no test of this rig determines")
     shown = {name for i in safe for name in outcomes[i].determined}
+    shown |= {name for name, one in now.items() if one.state == "determined"}
     left = [name for name in known.names if name not in shown]
     never = _beyond(known, left, limits, impacts=not contradicted)
     progress(0.97, "the velocity that closes the loop")
     return Plan(
+        name=tests[0].study or test.name,
         tests=tuple(one.problem.measurement for one in tests),
         model=known.problem.model.name,
         relaxation=known.problem.model.relaxation,
@@ -197,12 +200,15 @@ def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
             found.append(_published(one))
             continue
         read = load(one) if isinstance(one, str | Path) else one
-        fits = read.results.values() if isinstance(read, JointResult) else [read]
+        fits, study = [read], ""
+        if isinstance(read, JointResult):
+            fits, study = [*read.results.values()], read.name
         for fit in fits:
             if not isinstance(fit, FitResult):
                 raise InputError(f"{one} is not a fit or joint fit; name the folder of one")
+            fit = _with_record(fit, one) if isinstance(one, str | Path) else fit
             problem = problem_of(fit)
-            found.append(Test(problem, problem.vector(fit.params) - problem.origins, fit))
+            found.append(Test(problem, problem.vector(fit.params) - problem.origins, fit, study))
     if not found:
         raise InputError("name at least one result to plan from")
     first = found[0].problem.model
@@ -211,6 +217,20 @@ def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
     return same, {
         rung_name(x.problem.model.name, "none", x.problem.model.relaxation): x for x in rest
     }
+
+
+def _with_record(fit: FitResult, folder: str | Path) -> FitResult:
+    """Return a fit with the path of its record as found from the folder of the result.
+
+    A result names its record as the fit was given it, relative to the current directory of that
+    time, which usually contains the folder.
+    """
+    path = fit.measurement.path
+    if path is None:
+        return fit
+    places = (place / path for place in Path(folder).resolve().parents)
+    path = next((place for place in places if place.is_file()), path)
+    return replace(fit, measurement=replace(fit.measurement, path=path))
 
 
 def _published(name: str) -> Test:

@@ -124,7 +124,7 @@ def _check(key: str, answer: bool | None, *, fatal: bool = False, **facts: Any) 
 def _of_search(best: BestPoint, record: SearchRecord) -> Iterator[Check]:
     by, objective = record.stopped, best.problem.objective
     yield _check("ended", by is None, by=by, count=objective.evaluations)
-    total = sum(count for _, count in record.costs)
+    total = record.descents
     agreeing = record.agreeing if by is None and total else 0
     yield _check("agree", agreeing > 1 if agreeing else None, total=total, agreeing=agreeing)
     failed, tried = objective.failures, max(objective.evaluations, 1)

@@ -417,7 +417,7 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
         "nfev": objective.evaluations,
         "n_failed": objective.failures,
         "n_starts": record.starts,
-        "n_descents": len(record.costs),
+        "n_descents": record.descents,
         "n_agreeing": record.agreeing,
         "cycle_growth": cycle_growth(best),
     }

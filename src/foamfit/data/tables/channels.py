@@ -57,9 +57,9 @@ def read_channels(
     source: Source, duplicates: str, section: str = "columns", delay: float = 0.0
 ) -> Channels:
     """Read the channels of a table; for `duplicates` see `toml_file`."""
-    table, dropped = without_cut_row(source.table)
+    table, cut = without_cut_row(source.table)
     factors = {channel: source.factor(channel) for channel in source.columns}
-    numbers, rows, empty = read_numbers(table, source.columns)
+    numbers, rows, dropped = read_numbers(table, source.columns)
     if rows.size < MIN_ROWS:
         raise InputError(f"has fewer than {MIN_ROWS} rows; a test needs more.")
     notes = [source.note()]
@@ -80,8 +80,7 @@ def read_channels(
             counts = f"{int(match[1])} samples, the table has {rows.size}"
             notes.append(f"Check: row {row} announces {counts}.")
             break
-    if empty.size:
-        dropped.append(Dropped.of(empty, "no numbers in the columns in use"))
+    dropped = [*cut, *dropped]
     if "time" in numbers:
         if duplicates == "average":
             numbers, rows = _averaged(numbers, rows, dropped, notes)

@@ -104,6 +104,7 @@ def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
         except UnicodeDecodeError:
             text = raw.removeprefix(codecs.BOM_UTF8).decode("latin-1")
         text = text.lstrip("\ufeff")  # a converted file may have several byte order marks
+        text = re.sub(r"\u2212(?=[\d.,])", "-", text) if "\u2212" in text else text
         if "\0" in text:
             raise InputError("is a binary file; it must be a text table (CSV) or .xlsx.")
     return Text(path, re.sub(r"\r*\n|\r", "\n", text) if "\r" in text else text, sha256)
@@ -290,15 +291,15 @@ def _is_words(cells: list[str]) -> bool:
 
 def read_numbers(
     table: Table, columns: dict[str, int]
-) -> tuple[dict[str, Array], Integers, Integers]:
-    """Read columns without conversion; return numbers, row numbers, and rows without numbers.
+) -> tuple[dict[str, Array], Integers, list[Dropped]]:
+    """Read columns without conversion; return numbers, row numbers, and rows that are no samples.
 
     Times of day are converted to seconds. InputError names the first cell that is not a number.
     """
-    places, empty = list(columns.values()), list[int]()
+    places, dropped = list(columns.values()), list[Dropped]()
     read = _plain_numbers(table, places)
     if read is None:
-        read, rows, empty = _checked_numbers(table, columns)
+        read, rows, dropped = _checked_numbers(table, columns)
     else:
         rows = np.arange(table.first_row + 1, table.first_row + 1 + read.shape[1])
     for k, values in zip(places, read, strict=True):
@@ -308,7 +309,7 @@ def read_numbers(
     if "time" in columns and table.is_of_day(columns["time"]):  # past midnight
         time = read[[*columns].index("time")]
         time[:] = np.unwrap(time, period=DAY)
-    return dict(zip(columns, read, strict=True)), rows, np.array(empty, dtype=np.int64)
+    return dict(zip(columns, read, strict=True)), rows, dropped
 
 
 def _plain_numbers(table: Table, places: list[int]) -> Array | None:
@@ -330,12 +331,16 @@ def _plain_numbers(table: Table, places: list[int]) -> Array | None:
     return numbers if complete else None
 
 
-def _checked_numbers(table: Table, columns: dict[str, int]) -> tuple[Array, Integers, list[int]]:
+def _checked_numbers(
+    table: Table, columns: dict[str, int]
+) -> tuple[Array, Integers, list[Dropped]]:
     """Read the columns (k, n) cell by cell; see `read_numbers`.
 
-    A row is without numbers if it has a time at most, or if it is text below the table.
+    A row is no sample if it has a time at most, or if it is text below the table. Such text may
+    contain a number, as in "Max force,23,N".
     """
-    numbers, rows, empty, count = array("d"), array("q"), list[int](), len(table.headers)
+    numbers, rows, count = array("d"), array("q"), len(table.headers)
+    empty, remarks = list[int](), list[int]()
     places, below = list(columns.values()), list[tuple[int, InputError]]()
     measured = [k for name, k in columns.items() if name != "time"] or places
     for row, cells in table.rows():
@@ -362,15 +367,20 @@ def _checked_numbers(table: Table, columns: dict[str, int]) -> tuple[Array, Inte
         wrongs = ((table.headers[k].text, _wrong(cells[k], table.decimal)) for k in places)
         if bad := next((f"{name!r} is {wrong}" for name, wrong in wrongs if wrong), None):
             below.append((row, InputError(f"row {row}, column {bad}.")))
-        if below and (not bad or any(_is_number(cells[k]) for k in places)):
+        counts = any(_is_number(cells[k]) for k in places)
+        remark = cells[0][:1].isalpha() and not _is_sample(cells)
+        if below and (not bad or (counts and not remark)):
             raise below[0][1]
-        if not bad:
+        if bad:
+            (remarks if counts else empty).append(row)
+        else:
             numbers.extend(float(cells[k].replace(",", ".")) for k in places)
             rows.append(row)
     if below and not rows:
         raise below[0][1]
     read = np.array(numbers).reshape(-1, len(places)).T.copy()
-    return read, np.array(rows), sorted([*empty, *(row for row, _ in below)])
+    dropped = {"no numbers in the columns in use": empty, "a remark below the table": remarks}
+    return read, np.array(rows), [Dropped.of(np.array(n), why) for why, n in dropped.items() if n]
 
 
 def _since_midnight(hours: str, minutes: str, seconds: str, half: str | None) -> float:

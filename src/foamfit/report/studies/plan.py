@@ -112,6 +112,7 @@ class Quantity:
 class Plan(Result, OfLaw):
     """The tests that a rig can make, ranked by what they would determine; SI."""
 
+    name: str  #: that of the joint fit, or of the first test at hand
     tests: tuple[Measurement, ...]  #: the tests at hand
     model: str
     relaxation: int
@@ -121,7 +122,7 @@ class Plan(Result, OfLaw):
     advice: Outcome | None  #: that of the advised test; None if none is safe
     #: the pair of tests that determines most, with what both determine
     pair: tuple[Outcome, Candidate] | None
-    never: dict[str, str]  #: parameters that no test of this rig determines, and what would
+    never: dict[str, str]  #: parameters that no single test determines, and what would
     #: by striker mass: velocities that reach every branch in half, and in 95 % of the draws
     closing: dict[float, tuple[float, float]]
     quantity: Quantity | None
@@ -140,14 +141,11 @@ class Plan(Result, OfLaw):
         for one in self.tests:
             if one.path is None:
                 return f"{one.name} has no record"
+            if not one.path.is_file():
+                return f"the record of {one.name} is not found at {one.path}"
             if one.cycle != min(one.cycles) or one.last_cycle is not None:
                 return f"{one.name} was fitted with other cycles; a study reads the first of each"
         return ""
-
-    @property
-    def name(self) -> str:
-        """Name of the first test at hand."""
-        return self.tests[0].name
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -324,7 +322,7 @@ def draw_intervals(ax: Axes, plan: Plan) -> None:
             style |= {"linestyle": (0, (1, 1)) if unknown else "-"}
             ax.plot([-half, half], [i + shift] * 2, label=f"{'_' * bool(i)}{label}", **style)
     for edge in (-0.5, 0.5):
-        ax.axvline(edge, color="black", linewidth=0.5, linestyle=":")
+        ax.axvline(edge, color="black", linewidth=0.5)
     ax.set(yticks=range(len(names)), yticklabels=plan.own(names), ylim=(len(names) - 0.5, -0.5))
     ax.set_xscale("symlog", linthresh=0.1)
     ax.set(xticks=(-3, -0.5, 0, 0.5, 3), xlim=(-SHOWN, SHOWN))
