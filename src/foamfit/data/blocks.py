@@ -13,8 +13,9 @@ _MAX_ROWS = 1500  # more samples than this are averaged in blocks
 _BLOCKS = 1000  # number of these blocks, at most, unless a ramp would have too few
 _OF_RAMP = 100  # blocks of the fastest ramp
 _MOST_BLOCKS = 10_000
-_MOVES = 0.001  # least change of a moving block, as a share of the range
-_BEYOND = 6.0  # standard deviations of noise above which a block moves
+_LAG = _OF_RAMP // 10
+_MOVES = 0.005  # least change over so many blocks if they move, as a share of the range
+_BEYOND = 6.0  # standard deviations of noise above which they move
 
 
 def usual(rows: int) -> int:
@@ -45,15 +46,21 @@ def without_holds(record: Record) -> tuple[Record, int]:
 
 
 def _moving(record: Record, block: int) -> Mask:
-    """Return in which blocks, or next to which, motion or stress changes by more than noise."""
-    edges = np.arange(0, len(record), block)
-    out = np.zeros(edges.size)
+    """Return the blocks around which motion or stress changes by more than noise.
+
+    Means over a tenth of a ramp are compared, beside which noise is small.
+    """
+    blocks = -(-len(record) // block)
+    if blocks < 4 * _LAG:
+        return np.ones(blocks, dtype=bool)
+    edges, out = np.arange(0, len(record), block), np.zeros(blocks)
     for values in (record.stress, record.displacement):
         if values is not None:
-            change = np.abs(np.diff(means(values, edges)))
-            noise = _BEYOND * noise_level(values) * np.sqrt(2.0 / block)
-            out[1:] += change > max(noise, _MOVES * float(np.ptp(values)))
-    return np.convolve(out, np.ones(5), "same") > 0.5
+            mean = np.convolve(means(values, edges), np.full(_LAG, 1.0 / _LAG), "valid")
+            noise = _BEYOND * noise_level(values) * np.sqrt(2.0 / (block * _LAG))
+            moves = np.abs(mean[_LAG:] - mean[:-_LAG]) > max(noise, _MOVES * float(np.ptp(values)))
+            out += np.convolve(moves, np.ones(2 * _LAG))
+    return out > 0.5
 
 
 def thin(record: Record, size: int) -> Record:

@@ -195,15 +195,17 @@ def _first_motion(time: Array, w: Array, noise: NoiseLevel) -> tuple[float, bool
 def first_contact(record: Record) -> Record:
     """Leave out further contacts of a striker that rebounds and comes back.
 
-    The first contact has at least half of the largest stress; a flight lasts longer than twice the
-    longest contact.
+    The first contact has at least half of the largest stress and half of the impulse of all that
+    follow; a flight lasts longer than twice the longest contact.
     """
     stress, free = smooth(record.stress, 3), float(np.median(record.stress))
     share = (stress - free) / max(float(stress.max()) - free, 1e-300)
     edges = np.flatnonzero(np.diff(np.concatenate(([False], share > _AGAIN, [False]))))
     begins, ends = edges[::2], edges[1::2]
     for end, begin in zip(ends[:-1], begins[1:], strict=True):
-        if share[:end].max() >= 0.5 and begin - end > 2 * (ends - begins).max():
+        before, after = (float(part.clip(0.0).sum()) for part in (share[:begin], share[begin:]))
+        is_first = share[:end].max() >= 0.5 and before >= 0.5 * after
+        if is_first and begin - end > 2 * (ends - begins).max():
             why = "after the first contact, as the striker comes back"
             return record.without(slice((end + begin) // 2, None), why).noted(
                 "The striker comes back after its rebound; only the first contact is used."
@@ -334,7 +336,8 @@ def rise_of(
     """
     top = int(np.argmax(values))
     up, sigma, tau = values[: top + 1], noise.sigma, noise.time
-    base = float(up[:rest].mean()) if rest >= MIN_REST else float(np.percentile(up, 5.0))
+    low = min(float(np.percentile(up, 5.0)), float(up[:_LINE].mean()))  # a hold may come early
+    base = float(up[:rest].mean()) if rest >= MIN_REST else low
     if rest >= MIN_REST and (scatter := noise_about(values[:rest], 1))[0] > sigma:
         sigma, tau = scatter
     size = float(up[-1]) - base

@@ -82,8 +82,8 @@ def find_cycles(record: Record) -> list[Cycle]:
             peaks[-1] = int(peak)
     column, found = record.cycle, list[Cycle]()
     for place, (first, top, after) in enumerate(zip(rests, peaks, [*peaks[1:], None], strict=True)):
-        fall, end = w[top:after], len(record)
-        if fall[0] - fall.min() > _UNLOADED * size:
+        fall, end = w[top:after], after or len(record)
+        if fall[0] - fall.min() > _UNLOADED * (w[top] - low):
             end = top + int(np.argmax(fall <= fall.min() + 0.005 * size)) + 1
         number = place + 1 if column is None else round(float(column[top]))
         found.append(Cycle(number, place, first, top, end, turn=top))

@@ -9,6 +9,7 @@ likelihood (REML).
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -25,6 +26,7 @@ from foamfit.data.noise import quantum, residual_noise
 
 _DEGREE, _ORDER = 5, 3
 _SPOTS = 120  # number of trial instants for a new kink
+_SWINGS = 0.02  # largest distance from the samples between them, as a share of the range
 _ENOUGH = 1000  # samples in the search for kinks; more are averaged in blocks
 _KINKS = 40  # largest number of kinks
 _STIFF = 100.0  # multiple of the penalty while kinks are moved first: roughness then moves a kink
@@ -345,13 +347,34 @@ def follow(
     """
     times = np.arange(displacement.size, dtype=float) if time is None else time
     taken = slice(None) if counts is None else counts
-    return _found(times[taken].tobytes(), displacement[taken].tobytes(), noise)
+    return _cached(times[taken].tobytes(), displacement[taken].tobytes(), noise)
 
 
 @lru_cache(maxsize=32)
-def _found(raw_times: bytes, raw_motion: bytes, noise: NoiseLevel) -> SmoothMotion:
-    """Run `follow` with its arrays as bytes, which can be cached."""
+def _cached(raw_times: bytes, raw_motion: bytes, noise: NoiseLevel) -> SmoothMotion:
+    """Run `follow` with its arrays as bytes, which can be cached.
+
+    Where samples are very uneven, as in a long hold with few of them, no spline follows them all;
+    the motion is then that of the samples.
+    """
     times, w = np.frombuffer(raw_times), np.frombuffer(raw_motion)
+    with suppress(linalg.LinAlgError):
+        found = _found(times, w, noise)
+        if _keeps_to(found, times, w):
+            return found
+    return _exact(times, w, max(noise.sigma, residual_noise(w)[0]))
+
+
+def _keeps_to(found: SmoothMotion, times: Array, w: Array) -> bool:
+    """Return whether a motion stays near the samples between them."""
+    most = max(8.0 * found.sigma, _SWINGS * float(np.ptp(w)))
+    low, high = np.minimum(w[:-1], w[1:]) - most, np.maximum(w[:-1], w[1:]) + most
+    between = [found.at(times[:-1] + share * np.diff(times)) for share in (0.25, 0.5, 0.75)]
+    return all(bool(np.all((low <= one) & (one <= high))) for one in between)
+
+
+def _found(times: Array, w: Array, noise: NoiseLevel) -> SmoothMotion:
+    """Remove the noise by a spline with kinks."""
     start, duration = float(times[0]), float(np.ptp(times))
     x = (times - start) / duration
     middle, size = float(np.mean(w)), max(float(np.ptp(w)), 1e-300)

@@ -133,7 +133,9 @@ def _weights(time: Array) -> Array:
     for first in range(0, len(windows), _CHUNK):  # to limit memory
         x = windows[first : first + _CHUNK] - windows[first : first + _CHUNK, [_HALF]]
         powers = (x / np.abs(x).max(axis=1, keepdims=True))[:, :, None] ** np.arange(4)
-        at_middle = np.linalg.solve(powers.swapaxes(1, 2) @ powers, np.eye(4)[:, :1])
+        # The last term matters only where uneven steps leave a window singular.
+        squares = powers.swapaxes(1, 2) @ powers + 1e-12 * np.eye(4)
+        at_middle = np.linalg.solve(squares, np.eye(4)[:, :1])
         weights[first : first + _CHUNK] = -(powers @ at_middle)[:, :, 0]
     weights[:, _HALF] += 1.0
     step = np.diff(time)

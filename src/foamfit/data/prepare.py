@@ -402,7 +402,8 @@ def checks(
             raise InputError(f"{name} reaches {reached}; check its unit.")
         if largest > 1.05 * displacement.max():
             notes.append(f"Check: {name} goes farther than the top; check its unit and its node.")
-    stress, first = record.stress, record.stress[:3].mean()
+    stress = record.stress  # a fast ramp may load the second row
+    first = min(stress[:3].mean(), stress[0] + 3.0 * noise_level(stress))
     if first > 0.05 * peak:
         load = percent(first / peak)
         notes.append(f"Check: {zeros.UNDER_LOAD}, at {load} of the peak stress.")

@@ -142,7 +142,13 @@ def take_zeros(
                 note = f"Only {n} rows are certainly before contact: the zero of the {name} in the "
                 note += "file is kept."
             if zero.samples:
-                errors[name] = float(np.hypot(zero.error, _of_steps(values, values[:n])))
+                steps = _of_steps(values, values[:n])
+                errors[name] = float(np.hypot(zero.error, steps))
+                if impact and steps > zero.error:  # rows on one level do not show the zero again
+                    away = np.ones(len(record), dtype=bool)
+                    away[start.first : span.leaves] = False
+                    seen = record.sampled.get(name, ~away)
+                    record = replace(record, sampled=record.sampled | {name: seen & ~away})
         else:
             zero, source = _zero_of_motion(name, first, start, n, noise, impact=impact)
             top = name == "displacement"

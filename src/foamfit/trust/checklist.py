@@ -313,7 +313,7 @@ def _of_test(
 def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:
     """Check whether a driven single spring clearly lacks the damping (Pa·s) that was left out."""
     problem, name = best.problem, "s1_eta"
-    if problem.objective.drive != "displacement" or not best.names:
+    if problem.objective.drive == "impact" or not best.names:
         return _check("damping", None)
     damper, alone, eta = problem.params[name], len(problem.model.kinds) == 1, 0.0
     if alone and problem.measurement.time is not None and not damper.vary and damper.value == 0.0:
