@@ -10,7 +10,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any
@@ -104,16 +104,13 @@ def pytest_xdist_node_collection_finished(node: Any) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def compiled() -> Iterator[None]:
+def compiled() -> None:
     """Compile once the loops that most tests need.
 
     Commands then print no message about compiling.
     """
-    if cache.compiled():
-        yield
-        return
-    precompile.compile_solver()
-    yield
+    if not cache.compiled():
+        precompile.compile_solver()
 
 
 def run(*args: object, encoding: str = "utf-8") -> Result:
