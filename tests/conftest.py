@@ -233,14 +233,15 @@ def assert_near(found: ff.FitResult, truth: dict[str, float], errors: float) -> 
         assert abs(one.value - value) < errors * one.stderr, name
 
 
-def refused(path: Path, *words: str, specimen: Path | None = None) -> None:
-    """Check that a test is rejected with one sentence that contains these words."""
+def refused(path: Path, *words: str, specimen: Path | None = None) -> str:
+    """Check that a test is rejected with one sentence that contains these words; return it."""
     with pytest.raises(ff.InputError) as caught:
         ff.read_test(path, specimen)
     message = str(caught.value)
     assert "\n" not in message
     for word in words:
         assert word in message
+    return message
 
 
 @functools.cache
