@@ -275,9 +275,6 @@ def test_drives_and_noise_mix(tmp_path):
     assert result.parameters["s1_k0"].value == pytest.approx(5.5e6, rel=0.03)
 
 
-# ------------------------------------------------------------------------------- the command
-
-
 def test_the_command_writes_and_prints(folder, tmp_path, monkeypatch):
     without_pictures(monkeypatch)
     monkeypatch.setattr(joint_report.figures, "write_both", few_bytes)
@@ -345,9 +342,6 @@ def test_one_number_may_be_all_that_is_fitted(tmp_path):
     assert k0.kind == "shared"
     assert k0.ci95[0] < k0.value < k0.ci95[1]
     assert k0.range[0] < k0.value < k0.range[1]
-
-
-# ------------------------------------------------------------------- the last steps of a joint fit
 
 
 def test_joint_json_has_how_parameters_vary_together(found):
