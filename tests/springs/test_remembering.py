@@ -224,13 +224,8 @@ def test_inner_loops_return_to_where_they_began(name: str, by_strain: bool) -> N
     spring = SPRINGS[name]
     stress = 1e6 * np.array([0, 2.5, 0.6, 1.4, 0.9, 1.2, 0.9, 1.4, 0.6, 1.4, 0.6, 2.5, 3.0])
     follow = spring.strain
-    if by_strain:
-        given = spring.strain(stress)
-
-        def follow(levels: Array) -> Array:  # the inverse
-            return spring.stress(levels)
-
-        stress = given
+    if by_strain:  # the inverse
+        follow, stress = spring.stress, spring.strain(stress)
     out = follow(stress)
     # each pair of samples has the same level on the same path, with inner loops in between
     for one, other in [(3, 7), (7, 9), (2, 8), (8, 10), (4, 6), (1, 11)]:

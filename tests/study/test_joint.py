@@ -257,11 +257,10 @@ def test_drives_and_noise_mix(tmp_path):
         write_csv(tmp_path / f"{name}.csv", HEAD, t, stress, 1e3 * moved)
         striker = '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n' if name == "fast" else ""
         (tmp_path / f"{name}.toml").write_text(common + striker)
-    names = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
     study = tmp_path / "study.toml"
     study.write_text(
         'tests = ["*.csv"]\nmodel = "bistable"\nstarts = 2\n[parameters]\n'
-        + "\n".join(f's1_{name} = "shared"' for name in (*names, "eta"))
+        + "\n".join(f's1_{name} = "shared"' for name in spring.law.names)
     )
     result = ff.joint(study)
     assert result.drive is None
