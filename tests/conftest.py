@@ -10,7 +10,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any
@@ -104,16 +104,13 @@ def pytest_xdist_node_collection_finished(node: Any) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def compiled() -> Iterator[None]:
+def compiled() -> None:
     """Compile once the loops that most tests need.
 
     Commands then print no message about compiling.
     """
-    if cache.compiled():
-        yield
-        return
-    precompile.compile_solver()
-    yield
+    if not cache.compiled():
+        precompile.compile_solver()
 
 
 def run(*args: object, encoding: str = "utf-8") -> Result:
@@ -236,14 +233,15 @@ def assert_near(found: ff.FitResult, truth: dict[str, float], errors: float) -> 
         assert abs(one.value - value) < errors * one.stderr, name
 
 
-def refused(path: Path, *words: str, specimen: Path | None = None) -> None:
-    """Check that a test is rejected with one sentence that contains these words."""
+def refused(path: Path, *words: str, specimen: Path | None = None) -> str:
+    """Check that a test is rejected with one sentence that contains these words; return it."""
     with pytest.raises(ff.InputError) as caught:
         ff.read_test(path, specimen)
     message = str(caught.value)
     assert "\n" not in message
     for word in words:
         assert word in message
+    return message
 
 
 @functools.cache

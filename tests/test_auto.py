@@ -46,9 +46,6 @@ def groups(*names, relaxation=0):
     return tuple((Model.parse(name, relaxation),) for name in names)
 
 
-# ---------------------------------------------------------------- runs test
-
-
 def test_the_runs_test_holds_its_level_and_sees_waves():
     rng = np.random.default_rng(0)
     p = np.array([runs_test(rng.standard_normal(400)) for _ in range(1000)])
@@ -68,9 +65,6 @@ def test_the_neighbours_test_holds_its_level_and_sees_a_short_wave():
     short = rng.standard_normal(400)
     short[100:120] += 3.0
     assert neighbours_test(short) < 1e-4 < 1e-2 < runs_test(short)
-
-
-# ---------------------------------------------------------------- evidence
 
 
 def tried(residual, columns):
@@ -145,9 +139,6 @@ def test_a_bent_structure_is_found_where_it_is():
     assert found.size == pytest.approx(rms, rel=0.05)
 
 
-# ---------------------------------------------------------------- known structures
-
-
 def impact(springs, heights, velocity, samples=101):
     """Simulate an impact with noise of 0.5 %, whose level is not stated."""
     chain = ff.Chain(springs, heights, AREA)
@@ -201,9 +192,6 @@ def test_two_bistable_springs_are_told_from_fewer(monkeypatch):
     below = result.ladder.rungs[:2]
     assert all(rung.bic > result.ladder.chosen.bic + evidence.MARGIN for rung in below)
     assert result.ladder.rungs[0].neighbours_p < 1e-6
-
-
-# ---------------------------------------------------------------- prediction
 
 
 def choose_of(table, by_prediction, criteria=None):
@@ -312,9 +300,6 @@ def test_a_running_shoe_foam_ends_below_one_percent(thin_foams, tmp_path, monkey
     assert result.ladder.chosen.name == "microscale with relaxation"
 
 
-# --------------------------------------------------------------- which models
-
-
 def test_only_models_that_the_test_allows_are_tried(monkeypatch):
     tried = []
 
@@ -368,9 +353,6 @@ def test_only_the_chosen_rung_gets_the_intervals_that_were_asked_for(monkeypatch
     assert [(rung.model, rung.damping) for rung in result.ladder.rungs] == [("bistable", "none")]
     assert result.ladder.ended == "the residuals are random"
     assert (result.status, result.seed) == ("ok", 3)
-
-
-# ---------------------------------------------------------------- interruption
 
 
 @pytest.fixture(scope="module")
@@ -433,9 +415,6 @@ def test_the_time_limit_is_shared_over_the_rungs(wavy, monkeypatch):
     assert given == [1.5, 0.5]
     assert len(result.ladder.rungs) == 2
     assert result.stopped == "the time limit"
-
-
-# ---------------------------------------------------------------- output
 
 
 @pytest.fixture

@@ -36,8 +36,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
     strain = np.interp(t, times, corners)
     force = AREA * TRUTH.stress(strain) + 0.05 + rng.normal(0.0, 0.02, t.size)
     moved = 1e3 * HEIGHT * strain + 3.0
-    (folder / "foam.toml").write_text(TOML)
-    return write_csv(folder / "foam.csv", HEAD, t + 1.0, force, moved)
+    return write_csv(folder / "foam.csv", HEAD, t + 1.0, force, moved, toml=TOML)
 
 
 def test_cycles_are_read_as_one_history(record: Path) -> None:
@@ -70,10 +69,10 @@ def test_what_cannot_be_is_said_in_one_sentence(record: Path, given: list[str], 
 
 def test_cycles_of_a_record_without_any_are_refused(tmp_path: Path) -> None:
     t = np.linspace(0.0, 1.0, 60)
-    write_csv(tmp_path / "a.csv", "time (s),strain,stress (Pa)", t, 0.3 * t, 2e5 * t)
-    (tmp_path / "a.toml").write_text(TOML)
+    columns = (t, 0.3 * t, 2e5 * t)
+    path = write_csv(tmp_path / "a.csv", "time (s),strain,stress (Pa)", *columns, toml=TOML)
     with pytest.raises(ff.InputError, match="cycles 1 to 3 cannot be taken: the record has no"):
-        ff.read_test(tmp_path / "a.csv", cycles=(1, 3))
+        ff.read_test(path, cycles=(1, 3))
 
 
 def test_one_set_of_parameters_for_all_cycles_and_the_next(record: Path, tmp_path: Path) -> None:
@@ -131,9 +130,8 @@ def lifted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Chain]:
     assert stress.min() < -2e3  # without separation, the stress would be tensile
     stress = np.maximum(stress, 0.0) + np.where(t < 0.4, 2e3, 0.0)
     force = AREA * (stress + rng.normal(0.0, 100.0, t.size)) + 0.05
-    (folder / "foam.toml").write_text(TOML)
     moved = 1e3 * HEIGHT * strain + 3.0
-    return write_csv(folder / "foam.csv", HEAD, t, force, moved), chain
+    return write_csv(folder / "foam.csv", HEAD, t, force, moved, toml=TOML), chain
 
 
 def test_the_stress_between_cycles_is_the_zero_of_a_specimen_that_was_pressed(

@@ -16,9 +16,7 @@ import pytest
 
 import fabricated
 import foamfit.api
-import foamfit.report.figures
 import foamfit.report.folder
-import foamfit.results
 from conftest import RECONSTRUCTION, run, run_refused, without_pictures
 from foamfit.errors import InputError
 from foamfit.files import check_file, csv_bytes, replacing, write_file
@@ -34,9 +32,8 @@ posix = pytest.mark.skipif(os.name != "posix", reason="signals and permissions o
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Change to an empty directory and replace the pictures, so that saving is fast."""
     without_pictures(monkeypatch)
-    monkeypatch.setattr(
-        foamfit.report.figures, "images", lambda _, *forms: [b"\x89PNG" + bytes(20) for _ in forms]
-    )
+    png = b"\x89PNG" + bytes(20)
+    monkeypatch.setattr(figures, "images", lambda _, *forms: [png for _ in forms])
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -62,9 +59,6 @@ def left_behind(path: Path, ending: str, process: int) -> Path:
     return path.with_name(named.removesuffix("new") + ending)
 
 
-# ---------------------------------------------------------------- ownership of the folder
-
-
 def test_a_folder_a_link_or_a_json_of_others_is_not_what_a_fit_writes(here: Path) -> None:
     ladder = fabricated.result().save("r") / "ladder.csv"
     ladder.mkdir()
@@ -88,9 +82,6 @@ def test_the_current_directory_is_refused(here: Path, out: str) -> None:
     os.chdir(here / "cwd")
     path = out.format(here=here / "cwd")
     assert "current directory" in run_refused("fit", RECONSTRUCTION, "--out", path)
-
-
-# ---------------------------------------------------------------- no incomplete files
 
 
 def test_a_full_disk_leaves_the_older_file(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,9 +174,6 @@ def test_a_file_keeps_its_link_its_mode_and_a_device_what_it_is(here: Path) -> N
             write_file("pipe", b"through")
             assert reader.communicate()[0] == b"through"
         assert Path("pipe").is_fifo()
-
-
-# ---------------------------------------------------------------- remnants
 
 
 @posix

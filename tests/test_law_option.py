@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import run, run_refused, without_pictures, write_csv
+from conftest import SPECIMEN, run, run_refused, without_pictures, write_csv
 from foamfit.errors import InputError
 from foamfit.springs import laws
 
@@ -56,9 +56,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for seed in (1, 2):
         noise = 500.0 * np.random.default_rng(seed).standard_normal(strain.size)
         head = "time (s),stress (Pa),strain"
-        write_csv(tmp_path / f"t{seed}.csv", head, np.arange(61), stress + noise, strain)
-        toml = '[specimen]\nheight = "10 mm"\narea = "1 cm^2"\n'
-        (tmp_path / f"t{seed}.toml").write_text(toml)
+        columns = np.arange(61), stress + noise, strain
+        write_csv(tmp_path / f"t{seed}.csv", head, *columns, toml=SPECIMEN)
     return tmp_path
 
 

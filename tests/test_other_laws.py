@@ -10,7 +10,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.special import erf, gamma
 
 import foamfit as ff
-from conftest import write_csv
+from conftest import SPECIMEN, write_csv
 
 CURVE = {"mu": 2.3e5, "alpha": 9.0, "nu": 2e4, "beta": 2.5}
 UP_DOWN = np.concatenate([np.linspace(0.0, 0.6, 61), np.linspace(0.59, 0.0, 60)])
@@ -112,7 +112,6 @@ def test_power_law_damper_adds_a_power_of_the_rate():
 def test_a_law_that_depends_on_time_needs_one(tmp_path):
     law("fractional")
     path, strain = tmp_path / "t.csv", np.linspace(0.0, 0.5, 40)
-    toml = '[specimen]\nheight = "10 mm"\narea = "1 cm^2"\n'
-    write_csv(path, "strain,stress (Pa)", strain, stress(strain, **CURVE), toml=toml)
+    write_csv(path, "strain,stress (Pa)", strain, stress(strain, **CURVE), toml=SPECIMEN)
     with pytest.raises(ff.InputError, match="'fractional' needs a time column"):
         ff.fit(ff.read_test(path), model="fractional")

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-import foamfit.report.figures
-import foamfit.report.summary
 from conftest import AREA, HEIGHT, NAMES, run, small_pictures, synthetic_impact, write_measurement
 from foamfit import one_model
 from foamfit.data.measurement import Measurement, Outliers
@@ -32,9 +30,6 @@ def worst_deviation(result: ff.FitResult, spring: ff.BistableSpring) -> float:
     return max(
         abs(item.value - true) / item.stderr for item, true in zip(items, spring.seven, strict=True)
     )
-
-
-# --------------------------------------------------------------------------------------- outliers
 
 
 def spoilt_impact() -> tuple[ff.BistableSpring, Measurement, np.ndarray]:
@@ -87,9 +82,6 @@ def test_a_file_with_spikes_and_gaps_gives_the_parameters_of_the_spring(tmp_path
     assert result.noise["stress_time"]["given"] is False
     assert result.noise["stress_time"]["residual_over_noise"] == pytest.approx(1.0, abs=0.15)
     assert result.statistics["redchi"] == pytest.approx(1.0, abs=0.2)
-
-
-# ------------------------------------------------------------------------------------- time shift
 
 
 def shifted_impact(late: float, **changed: object) -> tuple[ff.BistableSpring, Measurement]:
@@ -159,9 +151,6 @@ def test_a_shift_without_two_channels_in_time_is_refused(changed, missing):
     with pytest.raises(ff.InputError, match=missing) as caught:
         ff.fit(replace(test, **changed), time_shift=True)
     assert "time shift" in str(caught.value)
-
-
-# ----------------------------------------------------------------------------------- interruption
 
 
 def test_a_stopped_fit_is_marked_everywhere(tmp_path, monkeypatch):

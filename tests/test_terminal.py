@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 import webbrowser
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -94,8 +95,7 @@ def test_a_reader_that_has_enough_changes_no_exit_code() -> None:
 def test_no_control_character_of_a_name_reaches_the_terminal(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    measurement = fabricated.result().measurement
-    named = type(measurement)(**{**vars(measurement), "name": ODD})
+    named = replace(fabricated.result().measurement, name=ODD)
     quick(monkeypatch, status="failed", measurement=named)
     toml = RECONSTRUCTION.with_suffix(".toml").read_text()
     escaped = json.dumps(ODD)
@@ -125,8 +125,7 @@ def test_a_name_that_is_no_unicode_is_written_and_printed(
 ) -> None:
     """Python decodes a file name in another encoding to such a name."""
     name = os.fsdecode(b"foam \xe9")
-    measurement = fabricated.result().measurement
-    named = type(measurement)(**{**vars(measurement), "name": name})
+    named = replace(fabricated.result().measurement, name=name)
     quick(monkeypatch, light=False, measurement=named)
     told = run("fit", RECONSTRUCTION, "--out", "r")
     assert (told.exit_code, told.stderr) == (0, "")

@@ -206,7 +206,7 @@ def test_a_last_row_that_is_cut_is_left_out_and_named(tmp_path, form, last, cut)
     ("factors", "words"),
     [
         ((2, 40), ["strain reaches 4", "height"]),
-        ((0, 4), ["'stress (MPa)' is constant"]),
+        ((0, 4), ["'stress (MPa)' is constant; a stress must vary"]),
         ((2, 0), ["'displacement (mm)' is constant"]),
         ((1e290, 4), ["'stress (MPa)' is up to 1e+290", "unit", "scale"]),
     ],

@@ -97,13 +97,9 @@ def test_a_result_below_the_table_is_a_remark(tmp_path: Path) -> None:
         ([*ROWS[:30], "here,the,force", *ROWS[30:]], "row 32, column 'time (s)' is 'here'"),
         ([*ROWS[:30], "Max force,200,N", *ROWS[30:]], "row 32, column 'time (s)' is 'Max force'"),
         ([*ROWS, "max,200,4"], "row 203, column 'time (s)' is 'max'"),
-        ([*ROWS[:30], "1.5,,1", *ROWS[31:]], "row 32, column 'force (N)' is empty"),
         ([f"{t},NaN,{w}" for t, w in zip(T, W, strict=True)], "row 2, column 'force (N)' is 'NaN'"),
         ([f"{t},{f},n/a" for t, f in zip(T, F, strict=True)], "row 2, column 'displacement (mm)'"),
-        ([f"{t},0,0" for t in T], "column 'force (N)' is constant; a force must vary"),
-        ([f"{t},{f},3" for t, f in zip(T, F, strict=True)], "'displacement (mm)' is constant"),
         (ROWS[:1], "fewer than 10 rows"),
-        ([], "a header in row 1 but no rows of numbers"),
     ],
 )
 def test_samples_that_are_not_numbers_are_refused_by_row(

@@ -58,9 +58,6 @@ def error_of_motion(conditioned):
     return np.sqrt(np.mean((conditioned.displacement - truth)[inside] ** 2)) / truth.max()
 
 
-# Where contact starts.
-
-
 @pytest.mark.parametrize("missing", [3, 30])
 @pytest.mark.parametrize("origin", [0.0, -4.0, 1.7e3])
 def test_the_rise_is_extrapolated_back_where_the_first_samples_are_missing(missing, origin):
@@ -70,9 +67,6 @@ def test_the_rise_is_extrapolated_back_where_the_first_samples_are_missing(missi
     assert len(done.stress) == len(record)
     assert done.zeros == {}
     assert any("Contact starts before the first sample" in note for note in done.notes)
-
-
-# Where contact ends.
 
 
 def test_a_low_stress_before_and_after_a_sharp_peak_is_contact():
@@ -106,23 +100,13 @@ def test_contact_ends_before_a_second_bounce(noise):
     assert end == pytest.approx(DURATION, rel=0.04)
 
 
-# Displacement.
-
-
 @pytest.mark.parametrize("source", ["force", "velocity", "acceleration"])
 @pytest.mark.parametrize("before", [0.0, 0.4])
 def test_motion_is_integrated_where_it_is_missing(source, before):
     record = impact(before=before, after=0.2 if before else 0.0, w="missing")
     stress, _, velocity = pulse(record.time)
-    deceleration = stress * SPECIMEN.area / STRIKER.mass
-    record = Record(
-        record.time,
-        record.stress,
-        None,
-        velocity if source == "velocity" else None,
-        deceleration if source == "acceleration" else None,
-    )
-    conditioned = run(record)
+    known = {"velocity": velocity, "acceleration": stress * SPECIMEN.area / STRIKER.mass}
+    conditioned = run(replace(record, **{name: known[name] for name in known if name == source}))
     assert conditioned.motion == f"integrated from {source}"
     assert any(conditioned.motion in note for note in conditioned.notes)
     assert error_of_motion(conditioned) < (5e-3 if before else 1e-5)
@@ -138,9 +122,6 @@ def test_a_staircase_becomes_its_ramp():
     assert np.flatnonzero(filled.sampled["displacement"]).tolist() == list(range(0, 1000, 5))
     coarse = Record(t, w, np.round(w / 1e-6) * 1e-6)  # by a digitiser, several rows to a step
     assert fill_staircase(coarse).displacement is coarse.displacement
-
-
-# Masses inside.
 
 
 def followed(record, share=0.4, zero=3e-3, noise=0.0):
@@ -183,9 +164,6 @@ def test_a_mass_inside_that_rests_within_the_window_is_refused():
         run(still, end=580 * DURATION / 600)
 
 
-# Slow tests.
-
-
 def cycles(n=3, hold=50):
     """Return trapezoids of 1 mm with holds at both ends, after a rest; stress ∝ displacement."""
     corners = np.cumsum([60, *(n * [200, hold, 200, hold])])
@@ -203,7 +181,7 @@ def test_cycles_are_told_from_each_other_however_far_the_machine_came_from():
     assert condition(record, SPECIMEN, window=Window(cycle=2)).cycles == (1, 2, 3)
 
 
-def preconditioned(set_strain, offset=0.0, noise=0.0, n=4, held=1.0, lowest=0.0):
+def preconditioned(set_strain, offset=0.0, noise=0.0, n=4, lowest=0.0):
     """Return triangles of 1 mm on a foam of 10 mm with a permanent set, with a slope of 1 MPa/mm.
 
     `set_strain` is the permanent set of each cycle, below which the stress is zero.
@@ -234,16 +212,11 @@ def test_a_later_cycle_starts_at_its_own_contact(cycle, noise):
     assert test.displacement.max() == pytest.approx(1e-3 - 1e-2 * gone, rel=0.02)
     assert test.displacement[-1] < 2e-5
     assert test.displacement.min() > -2e-5
-    whys = {item.why for item in condition_count(test)}
+    assert test.rows.rows == test.rows.used + sum(item.rows for item in test.rows.dropped)
+    whys = {item.why for item in test.rows.dropped}
     assert {"before contact starts", "after contact ends"} <= whys
     (told,) = [note for note in test.notes if "start strain" in note]
     assert f"Contact of cycle {cycle} starts" in told
-
-
-def condition_count(test):
-    """Return the dropped rows after a check that every row is used or dropped."""
-    assert test.rows.rows == test.rows.used + sum(item.rows for item in test.rows.dropped)
-    return test.rows.dropped
 
 
 def test_a_stress_below_zero_between_the_cycles_is_the_offset_of_the_sensor():
@@ -267,9 +240,6 @@ def test_a_cycle_that_is_not_there_is_refused():
         condition(cycles(), SPECIMEN, window=Window(cycle=4))
     with pytest.raises(InputError, match="slow tests"):
         run(impact(), cycle=2)
-
-
-# Window, thinning, checks.
 
 
 def test_the_window_is_by_the_clock_of_the_file():

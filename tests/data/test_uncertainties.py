@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from conftest import write_csv
+from conftest import refused, write_csv
 from foamfit.data.csv_file import read_test
 from foamfit.data.energy import audit
 from foamfit.errors import InputError
@@ -105,12 +105,8 @@ BAD = [
 @pytest.mark.parametrize(("text", "words"), BAD)
 def test_a_wrong_standard_deviation_is_refused(tmp_path, text, words):
     path = written(tmp_path, specimen(f'"{text}"'))
-    with pytest.raises(InputError) as refused:
-        read_test(path)
-    told = str(refused.value)
+    told = refused(path, text, words)
     assert told.startswith(f"{path.with_suffix('.toml')}: [specimen] height = ")
-    assert text in told
-    assert words in told
     assert told.count(". ") == 0  # a single sentence
 
 
@@ -126,10 +122,8 @@ def test_a_wrong_standard_deviation_is_refused(tmp_path, text, words):
     ],
 )
 def test_where_none_has_a_meaning_it_is_refused(tmp_path, toml, words):
-    with pytest.raises(InputError) as refused:
-        read_test(written(tmp_path, specimen() + toml))
-    assert words in str(refused.value)
-    assert "has a ±, which has no meaning here" in str(refused.value)
+    path = written(tmp_path, specimen() + toml)
+    refused(path, words, "has a ±, which has no meaning here")
 
 
 @pytest.mark.parametrize("scale", ["2 ± 2 N/V", "2 N/V ± 1 N", "2 ± x N/V", "2 ± -0.1 N/V"])

@@ -9,6 +9,11 @@ import foamfit as ff
 import rig
 from conftest import write_csv
 
+TOML = (
+    '[specimen]\nheight = "1.2 mm"\narea = "20 mm^2"\n'
+    '[striker]\nmass = "7 g"\nvelocity = "1.5 m/s"\ngravity = false\n'
+)
+
 
 @pytest.mark.parametrize("gauge", [True, False])
 @pytest.mark.parametrize("stated", [True, False])
@@ -59,10 +64,7 @@ def test_an_interior_zero_from_few_rows_is_uncertain(tmp_path, seed):
     columns = [one + 5e-3 * np.ptp(one) * rng.standard_normal(time.size) for one in curves]
     head = "time (ms),force (N),displacement (mm),displacement_1 (mm)"
     columns = (1e3 * time + 4.0, *columns)
-    toml = (
-        '[specimen]\nheight = "1.2 mm"\narea = "20 mm^2"\nheights = ["0.6 mm", "0.6 mm"]\n'
-        '[striker]\nmass = "7 g"\nvelocity = "1.5 m/s"\ngravity = false\n'
-    )
+    toml = TOML.replace("[striker]", 'heights = ["0.6 mm", "0.6 mm"]\n[striker]')
     path = write_csv(tmp_path / "impact.csv", head, *columns, fmt="%.6f", toml=toml)
     found = ff.fit(ff.read_test(path), model="linear+linear", starts=3, intervals="local")
     assert not any("law misses" in one for one in found.warnings)
@@ -70,3 +72,22 @@ def test_an_interior_zero_from_few_rows_is_uncertain(tmp_path, seed):
         one = found.parameters[name]
         assert abs(one.value - value) < 3.0 * one.stderr, name
         assert one.stderr < 0.02 * value
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_noise_of_a_velocity_is_no_error_of_the_law(tmp_path, seed):
+    """Its integral has slow waves, which were called an error of the law in every such record."""
+    height, area, mass, speed, stiffness = 1.2e-3, 2e-5, 7e-3, 1.5, 8e6
+    omega = np.sqrt(area * stiffness / (mass * height))
+    time = np.pi / omega / 300 * np.arange(-60, 380)
+    phase = np.clip(omega * time, 0.0, np.pi)
+    curves = [stiffness * speed / (omega * height) * np.sin(phase) * area, speed * np.cos(phase)]
+    rng = np.random.default_rng(seed)
+    columns = [one + 5e-3 * np.ptp(one) * rng.standard_normal(time.size) for one in curves]
+    head, columns = "time (ms),force (N),velocity (m/s)", (1e3 * time + 4.0, *columns)
+    path = write_csv(tmp_path / "impact.csv", head, *columns, fmt="%.6f", toml=TOML)
+    found = ff.fit(ff.read_test(path), model="linear", starts=3, intervals="local")
+    assert not any("law misses" in one or "law is at fault" in one for one in found.warnings)
+    one = found.parameters["s1_k0"]
+    assert abs(one.value - stiffness) < 3.0 * one.stderr
+    assert one.stderr < 0.01 * stiffness

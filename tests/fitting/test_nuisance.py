@@ -21,8 +21,7 @@ SPRING = ff.MicroscaleSpring(
     k0=5.5e5, kc=4e5, eps_star=0.3, sigma_plus=1.1e5, spread_plus=0.4, sigma_minus=7e4,
     spread_minus=0.6,
 )  # fmt: skip
-OF_SPRING = [SPRING.k0, SPRING.kc, SPRING.eps_star, SPRING.sigma_plus, SPRING.spread_plus,
-             SPRING.sigma_minus, SPRING.spread_minus, 0.0, 0.0]  # fmt: skip
+OF_SPRING = [*SPRING.values, 0.0]
 
 
 @pytest.mark.parametrize(

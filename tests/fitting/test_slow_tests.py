@@ -19,6 +19,7 @@ BISTABLE = {
     "k0": 1.2e6, "kc": 1.8e7, "dsigma": -5.9e4, "eps_a": 0.14, "eps_c": 0.45, "kh_plus": 1.1e6,
     "kh_minus": 4.2e5,
 }  # fmt: skip
+HEAD = "time (s),stress (kPa),displacement (mm)"
 QUICK = {"starts": 4, "intervals": "local"}
 
 
@@ -42,8 +43,7 @@ def test_a_machine_that_moves_before_contact_with_an_arbitrary_zero(
     stress = ff.MicroscaleSpring(**law).stress(np.maximum(strain, 0.0))
     curves = [stress / 1e3, 10.0 * strain + 0.8]
     noisy = [one + 4e-3 * np.ptp(one) * rng.standard_normal(time.size) for one in curves]
-    head = "time (s),stress (kPa),displacement (mm)"
-    path = write_csv(tmp_path / "slow.csv", head, time + 0.5, *noisy, fmt="%.6f", toml=TOML)
+    path = write_csv(tmp_path / "slow.csv", HEAD, time + 0.5, *noisy, fmt="%.6f", toml=TOML)
     found = ff.fit(ff.read_test(path), model="microscale", drive="stress", **QUICK)
     assert_near(found, law, 3.5)
     zero = found.parameters["displacement_zero"]
@@ -77,8 +77,7 @@ def test_the_offset_of_a_motion_that_begins_in_contact_is_found(
     stress = ff.simulate(chain, ff.DisplacementDrive(motion), time).base_stress
     curves = (stress / 1e3, 2e-3), (1e3 * motion + offset * 5.5, 5e-4)
     noisy = [one + s * np.ptp(one) * rng.standard_normal(time.size) for one, s in curves]
-    head = "time (s),stress (kPa),displacement (mm)"
-    path = write_csv(tmp_path / "slow.csv", head, time, *noisy, fmt="%.6f", toml=TOML)
+    path = write_csv(tmp_path / "slow.csv", HEAD, time, *noisy, fmt="%.6f", toml=TOML)
     assert_near(ff.fit(ff.read_test(path), intervals="local"), BISTABLE, 3.5)
 
 

@@ -90,9 +90,6 @@ def wait(worker, until=lambda worker: worker.ended is not None):
         time.sleep(0.02)
 
 
-# ------------------------------------------------------------------------------------- files
-
-
 @pytest.mark.parametrize(
     ("given", "safe"),
     [
@@ -150,9 +147,6 @@ def test_a_table_and_a_toml_that_arrive_together_belong_together(desk, order, mo
     assert desk.replaced
 
 
-# -------------------------------------------------------------------------------------- TOML
-
-
 def test_a_toml_is_split_and_joined_without_loss():
     text = """
 name = "a \\"foam\\" \\\\ 1"
@@ -192,9 +186,6 @@ def test_a_wrong_quantity_is_named(desk, quantity, value, told):
     assert wrong_quantity(str(refused.value)) == quantity
     assert str(desk.folder) not in str(refused.value)
     assert desk.measurement is None
-
-
-# --------------------------------------------------------------------------------------- fits
 
 
 @pytest.mark.usefixtures("without_process")
@@ -283,9 +274,6 @@ def test_a_closed_window_ends_its_fit(ready):
         os.kill(worker.process.pid, 0)
 
 
-# ------------------------------------------------------------------------------------- curves
-
-
 @pytest.mark.parametrize("drive", ["impact", "displacement"])
 def test_turned_curves_are_those_of_a_simulation(drive):
     measurement = ff.read_test(TEST)
@@ -309,9 +297,6 @@ def test_turned_curves_are_those_of_a_simulation(drive):
     along = response.strain if drive == "impact" else measurement.displacement / 1.19e-3
     np.testing.assert_allclose(strain, along, rtol=0.0, atol=1e-5)
     assert not np.allclose(stress, before.curves["stress_strain"][1], atol=1e-2 * size)
-
-
-# ------------------------------------------------------------- fixed and varied parameters
 
 
 def test_the_notebook_shows_a_history(tmp_path):
@@ -348,8 +333,6 @@ def test_ticks_say_what_a_fit_holds_and_varies():
     assert not any("range" in row for row in curves.sliders.rows)
     assert curves.chosen() == ({}, [])
 
-
-# ------------------------------- before a specimen is known: columns, curves, remedies as buttons
 
 ROWS = [f"{0.01 * k},{k},{0.02 * k}" for k in range(60)]
 

@@ -96,9 +96,6 @@ def test_a_path_leads_to_no_file(served):
         assert "root:" not in text
 
 
-# -------------------------------------------------------------------------------- the command
-
-
 def test_a_missing_extra_says_which_line_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "panel", None)
     assert 'pip install "foamfit[page]"' in run_refused("page")

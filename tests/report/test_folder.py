@@ -11,33 +11,23 @@ import pytest
 
 import fabricated
 import foamfit as ff
-import foamfit.report.figures
 import foamfit.report.folder
-import foamfit.report.summary
 from conftest import small_pictures
 from foamfit.errors import InputError
 from foamfit.report.figures import write_both
 from foamfit.report.folder import load_result, save_whole
 
 KEYS = {
-    "schema", "foamfit", "test", "data_sha256", "model", "drive", "interior_mass", "seed",
-    "status", "warnings",
-    "notes", "checklist", "data",
-    "parameters", "relaxation", "stiffening", "mullins", "derived", "visited", "misfit", "weights",
-    "specimen", "statistics", "energy",
-    "runtime_s", "stopped", "noise", "outliers", "load",
+    "schema", "foamfit", "test", "data_sha256", "model", "drive", "interior_mass", "seed", "status",
+    "warnings", "notes", "checklist", "data", "parameters", "relaxation", "stiffening", "mullins",
+    "derived", "visited", "misfit", "weights", "specimen", "statistics", "energy", "runtime_s",
+    "stopped", "noise", "outliers", "load",
 }  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return fabricated.result().save(tmp_path_factory.mktemp("fits") / "foam" / "bistable")
-
-
-@pytest.fixture
-def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Skip the slow figures, because these tests only check the folder."""
-    small_pictures(monkeypatch)
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -107,23 +97,23 @@ def test_curves_csv_gives_the_curves_back(saved: Path) -> None:
     assert [float(row["measured stress (Pa)"]) for row in table] == list(curves.measured_stress)
 
 
-@pytest.mark.usefixtures("no_figures")
 def test_masses_inside_have_their_columns(tmp_path: Path) -> None:
     result = fabricated.result()
     inside = 0.4 * result.curves.displacement
     curves = replace(result.curves, interior={1: (inside + 1e-6, inside)})
-    table = rows(replace(result, curves=curves).save(tmp_path / "r") / "curves.csv")
+    folder = replace(result, curves=curves).save(tmp_path / "r", report=False)
+    table = rows(folder / "curves.csv")
     names = ["measured displacement_1 (m)", "fitted displacement_1 (m)"]
     assert list(table[0])[-2:] == names
     assert [float(row[names[1]]) for row in table] == inside.tolist()
     assert float(table[0][names[0]]) == 1e-6
 
 
-@pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
 def test_failing_midway_leaves_the_older_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: type[BaseException]
 ) -> None:
+    small_pictures(monkeypatch)
     folder = fabricated.result(seed=1).save(tmp_path / "r")
 
     def fail(*_: object, **__: object) -> None:

@@ -69,8 +69,7 @@ def assert_same(got: Response, want: Response, most: float = 1e-9) -> None:
         assert np.abs(a - b).max() <= most * np.ptp(b)
     one, other = base_first(got.switches), base_first(want.switches)
     assert np.array_equal(one[:, 1:4], other[:, 1:4])
-    assert np.allclose(one[:, 0], other[:, 0], rtol=0.0, atol=1e-12)
-    assert np.allclose(one[:, 4], other[:, 4], rtol=0.0, atol=1e-12)
+    assert np.allclose(one[:, [0, 4]], other[:, [0, 4]], rtol=0.0, atol=1e-12)
     assert (got.contact_end is None) == (want.contact_end is None)
     if want.contact_end is not None:
         assert got.contact_end == pytest.approx(want.contact_end, rel=1e-9)
@@ -87,16 +86,6 @@ def test_the_springs_as_one_move_as_each_by_itself(count: int, drag: float, line
         assert_same(got, one_by_one(chain, speed))
         seen |= {BRANCH_NAMES[int(branch)] for branch in got.switches[:, 3]}
     assert seen == (set() if drag == 1e4 else {"a", "d", "c", "e"})
-
-
-def test_every_strain_is_on_the_law_of_its_spring() -> None:
-    chain = chain_of(12)
-    response = ff.simulate(chain, ff.Impact(STRIKER, 2.1), TIME)
-    pressed = response.base_stress > 0.0
-    moved = np.diff(response.displacement[:, pressed], axis=0, prepend=0.0)
-    for spring, height, w in zip(chain.springs, chain.heights, moved, strict=True):
-        want = response.base_stress[pressed]
-        assert np.abs(spring.stress(w / height) - want).max() <= 1e-9 * want.max()
 
 
 @pytest.mark.parametrize("speed", SPEEDS)

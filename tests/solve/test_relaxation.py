@@ -12,6 +12,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.special import ndtri
+from test_memory import value_of, with_value
 
 import foamfit as ff
 from independent import follow
@@ -25,8 +26,8 @@ def loops(turns: tuple[float, ...], samples: int) -> np.ndarray:
     return np.concatenate([[turns[0]], *legs])
 
 
-def chain(spring: Any, height: float = 2e-2) -> ff.Chain:
-    return ff.Chain([spring], [height], 1e-4)
+def chain(spring: Any) -> ff.Chain:
+    return ff.Chain([spring], [2e-2], 1e-4)
 
 
 def stress_of(
@@ -73,39 +74,26 @@ def test_a_held_strain_relaxes_exponentially() -> None:
     np.testing.assert_allclose(below, rest, rtol=1e-15)  # a chain starts without overstress
 
 
-NAMES = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus", "eta")
-OF_BISTABLE = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus", "eta")
-
-
 @pytest.mark.parametrize("terms", [[(0.5, 0.2)], [(0.5, 0.02), (0.0, 3.0)], []])
 @pytest.mark.parametrize("kind", ["microscale", "bistable"])
 def test_sensitivities_against_differences(kind: str, terms: Terms) -> None:
     eps = loops((0.0, 0.43, 0.21, 0.4, 0.06, 0.6, 0.01), 13)
     spring: Any = ff.MicroscaleSpring(*SHOE, eta=300.0, relaxation=terms)
-    short = [*NAMES, "height"]
     if kind == "bistable":
         eps *= 0.6
         spring = ff.BistableSpring(
             5.5e6, 82.5e6, -0.17907e6, 0.14, 0.31, 14.3e6, 2.3375e6, eta=300.0, relaxation=terms
         )
-        short = [*OF_BISTABLE, "height"]
     t = np.linspace(0.0, 1.0, eps.size)
+    short = [*spring.law.names, "height"]
     short += [f"{name}{k + 1}" for k in range(len(terms)) for name in ("g", "tau")]
     names = [f"s1_{name}" for name in short]
     got = stress_of(spring, eps, t, 1e-10, sensitivities=names).sensitivities
 
     def run(name: str, change: float) -> np.ndarray:
-        height, changed = 2e-2, spring
-        if name == "height":
-            height += change
-        elif name in ("g1", "tau1", "g2", "tau2"):
-            at = [list(pair) for pair in terms]
-            at[int(name[-1]) - 1][name[0] == "t"] += change
-            changed = replace(spring, relaxation=at)
-        else:
-            changed = replace(spring, **{name: getattr(spring, name) + change})
-        drive = ff.DisplacementDrive(2e-2 * eps)
-        return ff.simulate(chain(changed, height), drive, t, 1e-10).base_stress
+        value = value_of(chain(spring), f"s1_{name}") + change
+        changed = with_value(chain(spring), f"s1_{name}", value)
+        return ff.simulate(changed, ff.DisplacementDrive(2e-2 * eps), t, 1e-10).base_stress
 
     for name in short:
         size = 1e-5 * (1.0 if name[0] == "g" else 2e-2 if name == "height" else 0.0)
@@ -147,9 +135,6 @@ def test_moments_of_short_and_long_steps_meet() -> None:
         by_tau = -math.exp(-x) - math.expm1(-x) / x
         slope = got.sensitivities["s1_tau1"].base_stress[1]
         assert slope == pytest.approx(by_tau, rel=1e-7, abs=1e-15)
-
-
-# ------------------------------------------------------------------------ prescribed stress
 
 
 def test_what_a_spring_cannot_bear_is_refused() -> None:

@@ -178,9 +178,6 @@ def damped_base(label: str) -> Truth:
     return follow(chain, impact, np.linspace(0.0, end, 101))
 
 
-# ------------------------------------------------------------------------------- published facts
-
-
 def impact(name: str, n: int = 4001, rtol: float = 1e-9) -> tuple[ff.Response, np.ndarray, float]:
     """Response, strain of each spring and rebound velocity in the published impact."""
     t = np.linspace(0.0, 1.0e-3, n)
@@ -225,9 +222,6 @@ def test_foam_2_closes_its_loop() -> None:
     assert f"{rebound:.2f}" == "2.19"
 
 
-# ----------------------------------------------------------------------------------------- energy
-
-
 @pytest.mark.parametrize(
     ("name", "speed"), [("model-1", 1.75), ("model-1", 2.1), ("model-3", 2.1), ("two loops", 2.6)]
 )
@@ -249,9 +243,6 @@ def test_rebound_is_what_the_loop_leaves(name: str, speed: float) -> None:
         end = law(spring).strain_at(flag, 0.0)
         taken += AREA * h * law(spring).work([*during, end])[-1]
     assert 0.5 * 7e-3 * rebound**2 == pytest.approx(0.5 * 7e-3 * speed**2 - taken, rel=1e-8)
-
-
-# ----------------------------------------------------------------------------- documented behaviour
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -72,8 +71,6 @@ def cheap(point: Point) -> bool:
     rings = vibration and point.drive == "stress" and not (point.eta or point.site_eta)
     return point.springs <= (1 if vibration else 8) and point.samples <= 300 and not rings
 
-
-# ------------------------------------------------------------------------------------- the scenes
 
 BASES = {
     "impact, 1": Point(velocity=3.0),
@@ -148,9 +145,6 @@ def test_to_the_end_of_an_axis(axis: str) -> None:
             judge(point, answer)
 
 
-# ----------------------------------------------------------------------------------- the refusals
-
-
 def test_a_strain_at_the_end_of_its_branch_is_refused() -> None:
     _, why = ended(Point(velocity=100.0))  # a peak of 1e-15 s, between two samples
     assert "comes within" in why
@@ -161,7 +155,7 @@ def test_a_chaotic_motion_is_refused() -> None:
     point = Point(drive="displacement", springs=8, mass=1e-6, samples=401, kc_ratio=1e3)
     _, why = ended(point)
     assert "vibrations amplify the smallest error" in why
-    calm, _ = ended(dataclasses.replace(point, eta=1e3))
+    calm, _ = ended(replace(point, eta=1e3))
     assert calm is not None
 
 
@@ -190,7 +184,7 @@ def test_a_light_onsite_damper_beside_heavy_dashpots() -> None:
     answer, _ = ended(point)
     assert answer is not None
     assert answer.method == "Radau IIA"
-    without = ff.simulate(*scene_of(dataclasses.replace(point, site_eta=0.0)), rtol=RTOL)
+    without = ff.simulate(*scene_of(replace(point, site_eta=0.0)), rtol=RTOL)
     assert difference(answer, without) <= 1e-9  # the damper carries 1e-11 of the stress
 
 
@@ -199,7 +193,7 @@ def test_the_layer_after_a_jump_of_the_velocity_is_passed() -> None:
     point = Point(drive="displacement", springs=4, eta=1e7, mass=2e-12, height=5e-6, samples=5)
     answer, why = ended(point)
     assert answer is not None, why
-    free = ff.simulate(*scene_of(dataclasses.replace(point, mass=0.0)), rtol=RTOL)
+    free = ff.simulate(*scene_of(replace(point, mass=0.0)), rtol=RTOL)
     # Base stress jumps at samples: without masses it is the mean of both sides, with masses the
     # value before the jump.
     np.testing.assert_allclose(
@@ -207,24 +201,14 @@ def test_the_layer_after_a_jump_of_the_velocity_is_passed() -> None:
     )
 
 
-# -------------------------------------------------------------------------------------- the judge
-
-
 def test_contact_lasts_until_the_blow_has_come_through() -> None:
     """Before the wave reaches the base of a long chain, the stress there is only rounding."""
     point = next(p for _, p in swept() if p.springs == 100 and p.kinds == "unilateral+bistable"
                  and p.drive == "impact" and p.mass > 0.0)  # fmt: skip
-    chain, drive, time = scene_of(point)
-    scene = plan(chain, drive, time)
-    arrays = chain.arrays
-    explicit = scene._replace(implicit=False).run(arrays.rows, arrays.heights, 1e-8)
-    implicit = scene._replace(implicit=True).run(arrays.rows, arrays.heights, 1e-5)
+    explicit, implicit = bare(point, 1e-8, implicit=False), bare(point, 1e-5, implicit=True)
     assert explicit.contact_end == pytest.approx(implicit.contact_end, rel=1e-5)
     miss = np.abs(explicit.base_stress - implicit.base_stress).max()
     assert miss <= 1e-4 * explicit.base_stress.max()
-
-
-# --------------------------------------------------------------------------------- random scenes
 
 
 def test_nothing_presses_behind_an_open_gap() -> None:

@@ -25,34 +25,24 @@ from test_simulation import (
 )
 
 import foamfit as ff
-from foamfit.solve.plan import EXPLICIT_STEPS, RADAU, Motion, Plan, plan
+from foamfit.solve.plan import EXPLICIT_STEPS, RADAU, Motion, plan
+from foamfit.springs.chain import Drive
 
 PAIRS = {"model-3": (BASE_3, TOP_3, THREE, FOAM_1), "foam-2": (BASE_2, TOP_2, TWO, FOAM_2)}
 
 
 def run(
-    chain: ff.Chain,
-    load: ff.Impact | ff.StressDrive | ff.DisplacementDrive,
-    rtol: float,
-    implicit: bool | None = True,
-    time: np.ndarray = TIME,
+    chain: ff.Chain, load: Drive, rtol: float, implicit: bool | None = True, time: np.ndarray = TIME
 ) -> Motion:
     """Run a scene with implicit or explicit steps (None: chosen by the package)."""
-    return run_plan(plan(chain, load, time)._replace(implicit=implicit), chain, rtol)
-
-
-def run_plan(scene: Plan, chain: ff.Chain, rtol: float) -> Motion:
-    arrays = chain.arrays
-    return scene.run(arrays.rows, arrays.heights, rtol)
+    scene = plan(chain, load, time)._replace(implicit=implicit)
+    return scene.run(chain.arrays.rows, chain.arrays.heights, rtol)
 
 
 def struck(name: str, eta: float = 0.0, mass: float = 0.0) -> tuple[ff.Chain, ff.Impact]:
     base, top, heights, blow = PAIRS[name]
     springs = (damped(base, eta), damped(top, eta))
     return ff.Chain(springs, heights, AREA, (mass, 0.0)), blow
-
-
-# -------------------------------------------------------------------- against other solvers
 
 
 def integrated(name: str, drive: str) -> bool:
@@ -110,9 +100,6 @@ def test_flat_branch_under_stress_is_refused() -> None:
     for choice in (True, False):
         with pytest.raises(ff.SimulationError, match="flat branch"):
             run(chain, load, 1e-6, implicit=choice)
-
-
-# ------------------------------------------------------------------------------------- limits
 
 
 @pytest.mark.parametrize("name", PAIRS)
@@ -190,9 +177,6 @@ def test_contact_with_heavy_dashpots_ends_as_in_closed_form(eta: float) -> None:
         assert got.steps < 400
 
 
-# ------------------------------------------------------------------------------------- the choice
-
-
 def test_the_choice() -> None:
     blow = ff.Impact(7e-3, 1.75)
     methods = {
@@ -215,13 +199,10 @@ def test_the_choice() -> None:
 
 
 def test_the_bound_on_steps() -> None:
-    scene = struck("foam-2", 1e-2)
-    few = plan(scene[0], scene[1], TIME, max_steps=5)._replace(implicit=True)
+    chain, load = struck("foam-2", 1e-2)
+    few = plan(chain, load, TIME, max_steps=5)._replace(implicit=True)
     with pytest.raises(ff.SimulationError, match="bound of 5 steps"):
-        run_plan(few, scene[0], 1e-6)
-
-
-# ----------------------------------------------------------------------------- energy and contact
+        few.run(chain.arrays.rows, chain.arrays.heights, 1e-6)
 
 
 @pytest.mark.parametrize("implicit", [True, False])
@@ -232,9 +213,6 @@ def test_a_switch_shortly_before_the_end_of_contact_is_found(implicit: bool) -> 
         got = run(CHAINS["foam-2"], blow, rtol, implicit)
         assert got.switches[:, 1:4].tolist() == [[1, 0, 1], [1, 1, 2], [1, 2, 3]]
         assert got.contact_end == pytest.approx(want.contact_end, rel=100.0 * rtol)
-
-
-# ------------------------------------------------------------------------------------- long chains
 
 
 def long_chain(n: int, kind: str) -> ff.Chain:
@@ -249,9 +227,7 @@ def test_a_long_chain_behaves_as_a_short_one(kind: str) -> None:
     """Alternating springs of equal heights represent the same foam for any number of springs."""
     found = []
     for n in (20, 100):
-        scene = plan(long_chain(n, kind), ff.Impact(7e-3, 2.0), TIME)
-        arrays = long_chain(n, kind).arrays
-        got = scene._replace(implicit=True).run(arrays.rows, arrays.heights, 1e-5)
+        got = run(long_chain(n, kind), ff.Impact(7e-3, 2.0), 1e-5)
         assert len(got.switches) == 2 * n
         assert got.steps < 3000
         found.append((got.contact_end, got.base_stress.max()))

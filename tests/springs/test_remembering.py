@@ -180,9 +180,6 @@ def test_without_memory_it_is_section_6_bit_for_bit() -> None:
     assert once.stress(PLAIN.strain(up)) == pytest.approx(up, rel=1e-12)
 
 
-# ---------------------------------------------------------------------------------- refusals
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -220,9 +217,6 @@ def test_a_tension_that_the_softened_branch_cannot_carry_is_refused() -> None:
         WORN.stress(np.array([0.0, 1.0 + WORN.eps_star]))
 
 
-# ----------------------------------------------------------------------------------- loops
-
-
 @pytest.mark.parametrize("name", SPRINGS)
 @pytest.mark.parametrize("by_strain", [False, True])
 def test_inner_loops_return_to_where_they_began(name: str, by_strain: bool) -> None:
@@ -230,22 +224,14 @@ def test_inner_loops_return_to_where_they_began(name: str, by_strain: bool) -> N
     spring = SPRINGS[name]
     stress = 1e6 * np.array([0, 2.5, 0.6, 1.4, 0.9, 1.2, 0.9, 1.4, 0.6, 1.4, 0.6, 2.5, 3.0])
     follow = spring.strain
-    if by_strain:
-        given = spring.strain(stress)
-
-        def follow(levels: Array) -> Array:  # the inverse
-            return spring.stress(levels)
-
-        stress = given
+    if by_strain:  # the inverse
+        follow, stress = spring.stress, spring.strain(stress)
     out = follow(stress)
     # each pair of samples has the same level on the same path, with inner loops in between
     for one, other in [(3, 7), (7, 9), (2, 8), (8, 10), (4, 6), (1, 11)]:
         assert out[other] == pytest.approx(out[one], rel=1e-12), (one, other)
     # past the old peak, first loading continues as if the loops had not happened
     assert out[12] == pytest.approx(follow(stress[[0, 12]])[1], rel=1e-12)
-
-
-# ------------------------------------------------------------------------------------- derivatives
 
 
 @pytest.mark.parametrize("name", SPRINGS)

@@ -89,9 +89,6 @@ def stamps(out):
     return {p.parent.name: p.stat().st_mtime_ns for p in Path(out).glob("*/batch.json")}
 
 
-# ------------------------------------------------------------------------- output
-
-
 def test_the_same_numbers_with_any_number_of_processes_and_anywhere(here):
     (here / "tests/c.csv").unlink()
     again(out="one", executor=None, jobs=1, **QUICK)
@@ -139,9 +136,6 @@ def test_a_cycle_is_a_row_and_its_folder_is_in_that_of_the_test(here, monkeypatc
     assert stamps("out") == before
 
 
-# ------------------------------------------------------------------------- called again
-
-
 def test_only_what_is_missing_or_has_changed_is_fitted(here, tried):
     first = again()
     assert tried == ["a", "b", "c"]
@@ -164,9 +158,6 @@ def test_only_what_is_missing_or_has_changed_is_fitted(here, tried):
         change()
         again(**call)
         assert sorted(tried) == (["a", "b", "c", "d"] if wanted is None else wanted)
-
-
-# ------------------------------------------------------------------------- failures
 
 
 def test_a_defect_is_a_row_and_ends_nothing(here, tried, monkeypatch):
@@ -305,9 +296,6 @@ def test_a_folder_with_files_of_others_is_refused(here, tried, place):
     assert len(tried) == 3
 
 
-# ------------------------------------------------------------------------- the command
-
-
 def alive(process):
     """Return whether a process runs; an ended process that nobody waits for is a zombie."""
     import psutil
@@ -423,9 +411,6 @@ def test_a_dask_cluster_loses_a_worker_and_no_test(here):
     again(starts=2, out="local")
     assert len(numbers("out")) == 3
     assert numbers("out") == numbers("local")
-
-
-# ------------------------------------------------------------------------- the page
 
 
 def rows_of(count):

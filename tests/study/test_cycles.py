@@ -58,9 +58,7 @@ def test_a_cycle_that_is_not_there_is_a_row_with_its_sentence(found):
 
 @pytest.mark.parametrize("at", ["reading", "fit"])
 def test_ctrl_c_keeps_what_was_found(record, monkeypatch, at):
-    from foamfit.study import cycles
-
-    tried, real = [], cycles.fit
+    tried, real = [], cycles_report.fit
 
     def fit(*words, **options):
         tried.append(1)
@@ -70,7 +68,7 @@ def test_ctrl_c_keeps_what_was_found(record, monkeypatch, at):
             raise KeyboardInterrupt
         return real(*words, **options)
 
-    monkeypatch.setattr(cycles, "fit", fit)
+    monkeypatch.setattr(cycles_report, "fit", fit)
     kept = ff.fit_cycles(record, starts=2, intervals="local")
     assert list(kept.results) == {"reading": [1], "fit": [1, 2]}[at]
     assert all("Ctrl-C" in why for why in kept.refused.values())

@@ -257,11 +257,10 @@ def test_drives_and_noise_mix(tmp_path):
         write_csv(tmp_path / f"{name}.csv", HEAD, t, stress, 1e3 * moved)
         striker = '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n' if name == "fast" else ""
         (tmp_path / f"{name}.toml").write_text(common + striker)
-    names = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
     study = tmp_path / "study.toml"
     study.write_text(
         'tests = ["*.csv"]\nmodel = "bistable"\nstarts = 2\n[parameters]\n'
-        + "\n".join(f's1_{name} = "shared"' for name in (*names, "eta"))
+        + "\n".join(f's1_{name} = "shared"' for name in spring.law.names)
     )
     result = ff.joint(study)
     assert result.drive is None
@@ -273,9 +272,6 @@ def test_drives_and_noise_mix(tmp_path):
     # Besides the spring's: contact time and zero of the impact, and the zero of the slow motion.
     assert result.fit.found.n_vary == 8 + 3
     assert result.parameters["s1_k0"].value == pytest.approx(5.5e6, rel=0.03)
-
-
-# ------------------------------------------------------------------------------- the command
 
 
 def test_the_command_writes_and_prints(folder, tmp_path, monkeypatch):
@@ -345,9 +341,6 @@ def test_one_number_may_be_all_that_is_fitted(tmp_path):
     assert k0.kind == "shared"
     assert k0.ci95[0] < k0.value < k0.ci95[1]
     assert k0.range[0] < k0.value < k0.range[1]
-
-
-# ------------------------------------------------------------------- the last steps of a joint fit
 
 
 def test_joint_json_has_how_parameters_vary_together(found):

@@ -58,9 +58,6 @@ def together(tmp_path_factory):
     return folder, *fit_together(folder, 0)
 
 
-# ------------------------------------------------------------------------------- joint fits
-
-
 def test_each_test_has_its_own_contact_zero_and_striker(together):
     _, records, found = together
     content = json.loads(json.dumps(found.to_json_dict(), allow_nan=False))["parameters"]
@@ -92,9 +89,6 @@ def test_intervals_of_shared_values_hold_the_truth(together, tmp_path):
             off.append(abs(one.value - truth) / one.stderr)
     assert np.mean(inside) > 0.9
     assert max(off) < 4.0
-
-
-# ------------------------------------------------------------------------------- predictions
 
 
 @pytest.fixture(scope="module")

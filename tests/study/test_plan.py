@@ -148,14 +148,14 @@ def test_expected_widths_are_those_of_a_joint_fit_with_the_advised_test(of_publi
         channels = [time * 1e3, seen.base_stress / 1e6, seen.displacement[-1] * 1e3]
         noise = [0.0, sizes["stress"] / 1e6, sizes["displacement"] * 1e3]
         rows = np.transpose(channels) + rng.standard_normal((time.size, 3)) * noise
-        write_csv(tmp_path / f"{name}.csv", "time (ms),stress (MPa),displacement (mm)", rows)
-        (tmp_path / f"{name}.toml").write_text(
+        toml = (
             '[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n'
             f'[striker]\nmass = "7 g"\nvelocity = "{speed} m/s"\n'
             f'[noise]\nstress = "{sizes["stress"]} Pa"\n'
-            f'displacement = "{sizes["displacement"]} m"\n',
-            encoding="utf-8",
+            f'displacement = "{sizes["displacement"]} m"\n'
         )
+        head = "time (ms),stress (MPa),displacement (mm)"
+        write_csv(tmp_path / f"{name}.csv", head, rows, toml=toml)
     names = [name for name in found.now if name != "s1_eta"]  # true value 0, at its limit
     (tmp_path / "both.toml").write_text(
         'name = "both"\ntests = ["first.csv", "second.csv"]\nmodel = "bistable"\n[parameters]\n'

@@ -49,9 +49,10 @@ def values_of(problem: Problem, *springs: ff.BistableSpring, **given: float) -> 
     return problem.space().complete(values)
 
 
-def best_of(problem: Problem, spring: ff.BistableSpring) -> BestPoint:
-    """Return the best point for the parameters of one spring."""
-    return BestPoint(problem, values_of(problem, spring))
+def concluded_of(problem: Problem, spring: ff.BistableSpring, *more: Any) -> Any:
+    """Return the conclusions at the parameters of one spring."""
+    found = BestPoint(problem, values_of(problem, spring))
+    return conclude(found, *more or (SearchRecord(0, 8, 0.0, AGREED),))
 
 
 def insight_of(scaled: np.ndarray, values: np.ndarray | None = None) -> Insight:
@@ -136,8 +137,7 @@ def test_the_weakest_direction_is_told_in_words() -> None:
 
 def test_the_shares_of_the_information_add_up_and_lie_where_the_branch_is() -> None:
     spring, test = synthetic_impact()
-    problem = problem_of(test, drive="displacement")
-    result = conclude(best_of(problem, spring), SearchRecord(0, 1, 0.0, AGREED))
+    result = concluded_of(problem_of(test, drive="displacement"), spring)
     parts, shares = result.insight.parts, result.insight.shares()
     assert np.sum(shares, axis=1) == pytest.approx(np.ones(len(result.insight.names)))
     where = {
@@ -163,9 +163,8 @@ def concluded(
     """Return the conclusions at the true parameters of a synthetic impact."""
     spring, test = synthetic_impact(samples=201)
     problem = problem_of(test if measurement is None else measurement, **given)
-    values = values_of(problem, spring)
     found = SearchRecord(0, 8, 0.0, **({"costs": AGREED} | (record or {})))
-    return conclude(BestPoint(problem, values), found, intervals)
+    return concluded_of(problem, spring, found, intervals)
 
 
 def answers(result: Any) -> dict[str, bool | None]:
@@ -218,7 +217,7 @@ def test_trials_that_fail_and_masses_that_ring_are_asked_after() -> None:
     spring, test = synthetic_impact(samples=201)
     problem = problem_of(test)
     problem.objective.spent = Spent(10, 90)
-    result = conclude(best_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
+    result = concluded_of(problem, spring)
     assert answers(result)["simulated"] is False
     item = ff.published["foam-1/model-3"]
     heavy = replace(test, specimen=Specimen(HEIGHT, AREA, 5.56e-6, item.chain.heights))
@@ -249,8 +248,7 @@ def test_a_profile_much_narrower_than_the_local_interval_is_not_taken() -> None:
 
 def test_what_the_test_does_not_say_is_neither_yes_nor_no() -> None:
     spring, test = synthetic_loop()
-    problem = problem_of(test, drive="displacement")
-    result = conclude(best_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
+    result = concluded_of(problem_of(test, drive="displacement"), spring)
     assert answers(result)["energy"] is None
     assert answers(result)["impulse"] is None
     assert answers(result)["noise"] is True  # since the noise is estimated from the record
@@ -259,8 +257,7 @@ def test_what_the_test_does_not_say_is_neither_yes_nor_no() -> None:
 
 def test_a_damper_that_may_be_none_is_not_called_determined() -> None:
     spring, test = synthetic_impact(eta=8.0)
-    problem = problem_of(test, damped=True)
-    result = conclude(best_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
+    result = concluded_of(problem_of(test, damped=True), spring)
     item = result.parameters["s1_eta"]
     assert item.ci95[0] == 0.0
     assert item.state == "weak"
@@ -271,6 +268,5 @@ def test_a_damper_that_may_be_none_is_not_called_determined() -> None:
     expected = "7 of 8 are determined; consistent with zero, with a small upper bound: s1_eta."
     assert told.sentence == expected
     spring, test = synthetic_impact(eta=60.0)
-    problem = problem_of(test, damped=True)
-    result = conclude(best_of(problem, spring), SearchRecord(0, 8, 0.0, AGREED))
+    result = concluded_of(problem_of(test, damped=True), spring)
     assert result.parameters["s1_eta"].state == "determined"
