@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 import foamfit as ff
 import rig
 from conftest import write_csv
-from foamfit.data.contact import rise_of
+from foamfit.data.contact import first_contact, rise_of
 from foamfit.data.csv_file import read_test
 from foamfit.data.cycles import loading_rate
 from foamfit.data.energy import audit
@@ -115,6 +115,9 @@ def test_of_two_hits_the_first_is_used():
     assert done.origins["contact_time"] == pytest.approx(0.0, abs=0.01 * DURATION)
     assert done.time[-1] < 1.5 * DURATION
     assert any("only the first contact is used" in note for note in done.notes)
+    short = record("F", n=40, before=1000)
+    short.stress[20:28] = 0.75 * PEAK  # a glitch brings no momentum
+    assert first_contact(short) is short
 
 
 @pytest.mark.parametrize(("level", "least", "most"), [(1e-4, 0.28, 0.3), (0.01, 0.01, 0.1)])

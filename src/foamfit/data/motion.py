@@ -78,7 +78,7 @@ class _Samples:
                 little *= 10.0
         rough = np.maximum(rough, np.finfo(float).eps * rough[-1])  # smaller ones are rounding
         rough[:_ORDER] = 0.0
-        basis, data = basis @ rotation, 1.0 - little * rough
+        basis, data = basis @ rotation, np.maximum(1.0 - little * rough, 0.0)
         return cls(x, y, knots, rotation, basis, data, rough, basis.T @ y)
 
     @cached_property
