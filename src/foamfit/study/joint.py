@@ -134,6 +134,11 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
                     "test"
                 )
             options.problem(test, study.model)
+            same = (one for _, one, other in found if other.data_sha256 == test.data_sha256)
+            if (twin := next(same, None)) is not None:
+                raise InputError(
+                    f"{path}: its rows are those of {twin.name}; leave one of them out"
+                )
             found.append((name, path, test))
         except (InputError, SimulationError) as error:
             refused[str(path)] = str(error)
