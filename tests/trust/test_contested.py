@@ -170,7 +170,7 @@ def test_tests_of_a_joint_fit_have_the_same_default(
 ) -> None:
     without_pictures(monkeypatch)
     rig.write(record_of(2, velocity=0.9), tmp_path, "wrong")
-    rig.write(record_of(2), tmp_path, "right")
+    rig.write(record_of(2, force=1.0001), tmp_path, "right")  # other rows
     study = tmp_path / "study.toml"
     study.write_text(
         'tests = ["*.csv"]\nmodel = "microscale"\nstarts = 2\n[parameters]\ns1_k0 = "shared"\n'
