@@ -9,6 +9,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
+from scipy.signal import savgol_filter
 
 from foamfit.arrays import Array
 from foamfit.data.calibration import contradictions
@@ -143,10 +144,17 @@ def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> d
 
 
 def smooth_stress(measurement: Measurement, time: Array) -> SmoothMotion | None:
-    """Return the measured stress without its noise, Pa; None if the samples are to be used."""
+    """Return the measured stress without its noise, Pa; None if the samples are to be used.
+
+    The pulse of an impact has kinks that a spline takes for noise; see `driving_stress`.
+    """
     stress, level = measurement.stress, measurement.noise.of("stress")
     assert stress is not None  # checked by check_drive
-    if level is None or level.sigma <= EXACT * float(np.ptp(stress)):
+    if (
+        measurement.striker is not None
+        or level is None
+        or level.sigma <= EXACT * float(np.ptp(stress))
+    ):
         return None
     found = follow(time, stress, level, measurement.sampled.get("stress"))
     return found if found.sigma <= FOLLOWED * level.sigma else None
@@ -158,11 +166,22 @@ def driving_stress(
     """Return the stress (Pa) of a test that drives a model; it is zero before contact.
 
     Noise of a driving stress biases the soft branches (errors in variables), so that it is removed
-    as that of a driving motion. Chains with a unilateral spring carry no tension.
+    as that of a driving motion: that of the pulse of an impact by a moving parabola over a
+    twenty-fifth of the samples, which loading and unloading have of their own, as one across the
+    peak would cut it off. Chains with a unilateral spring carry no tension.
     """
-    assert measurement.stress is not None  # checked by check_drive
-    stress = measurement.stress if smooth is None else smooth.at(time)
-    stress = np.where(time < (measurement.rise or (0.0, 0.0))[0], 0.0, stress)
+    stress, begins = measurement.stress, (measurement.rise or (0.0, 0.0))[0]
+    assert stress is not None  # checked by check_drive
+    if measurement.striker is not None:
+        window, first = 2 * (stress.size // 50) + 1, int(np.searchsorted(time, begins))
+        top = first + int(np.argmax(stress[first:]))
+        parts = [stress[:first], stress[first:top], stress[top:]]
+        stress = np.concatenate(
+            [savgol_filter(own, window, 2) if own.size > window > 3 else own for own in parts]
+        )
+    elif smooth is not None:
+        stress = smooth.at(time)
+    stress = np.where(time < begins, 0.0, stress)
     return np.maximum(stress, 0.0) if "unilateral" in model.kinds else stress
 
 

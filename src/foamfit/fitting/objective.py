@@ -220,7 +220,7 @@ class Objective:
         """
         uncertain = self.by_motion(values)
         if uncertain is None:
-            self.explained = False
+            self.explained = self.measurement.striker is not None  # noise is in a smoothed pulse
             return False
         plain = self.plain(values)
         levels = [

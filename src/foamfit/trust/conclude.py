@@ -47,9 +47,6 @@ from foamfit.trust.residuals.law_error import CurveError
 # If an interval and the local one differ by more than this factor, the local one is misleading.
 ASTRAY = 2.0
 CLOSE = 0.9  # smallest correlation that is named
-# Share of the peak stress, from which noise of a stress that drives an impact may be missing in the
-# intervals: smoothing also removes kinks of the pulse.
-NOISY = 0.001
 UNDER = 0.05  # share of the peak stress, above which a record ends under load
 
 
@@ -236,15 +233,12 @@ def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict
     objective, errs = best.problem.objective, bool(best.names) and best.misfits
     assert test.stress is not None
     ended = float(test.stress[-3:].mean() / test.stress.max())
-    noise, smooth = test.noise.of("stress"), objective.scenes.smooth
-    noisy = bool(noise and smooth and noise.sigma > NOISY * float(test.stress.max()))
     misfit, curve = max((objective.off(best.simulated, n) or 0.0, n) for n in objective.counted)
     return {
         "stopped": not intervals.ranged,
         "vibrates": objective.interior_mass,
         "begun": (model.relaxation or objective.drive == "impact")
         and any(UNDER_LOAD in note for note in test.notes),
-        "driven": objective.drive == "stress" and test.striker is not None and noisy,
         "ended": ended if errs and objective.drive != "impact" and ended > UNDER else 0.0,
         "lost": lost_height(best),
         "alone": errs and not (record.stopped or record.led) and 0 < record.agreeing < 2,
