@@ -18,23 +18,19 @@ _MOVES = 0.005  # least change over so many blocks if they move, as a share of t
 _BEYOND = 6.0  # standard deviations of noise above which they move
 
 
-def usual(rows: int) -> int:
-    """Return the rows in a block of a record without long holds; 1 if it is short."""
-    return -(-rows // _BLOCKS) if rows > _MAX_ROWS else 1
-
-
-def without_holds(record: Record) -> tuple[Record, int]:
+def without_holds(record: Record, *, impact: bool = False) -> tuple[Record, int]:
     """Leave out most rows of long holds and rests; return also the rows in a block of `thin`.
 
-    The means of a few large blocks of a ramp would not lie on the curves. Between many cycles there
-    is nothing to leave out: they have more blocks.
+    An impact has none. The means of a few large blocks of a ramp would not lie on the curves.
+    Between many cycles there is nothing to leave out: they have more blocks.
     """
-    n, size = len(record), usual(len(record))
+    n = len(record)
+    size = -(-n // _BLOCKS) if n > _MAX_ROWS else 1
     values = record.stress if record.displacement is None else record.displacement
     steady = smooth(values, size // 2 + 1)
     tenths = [int(np.argmax(steady >= 0.1 * k * steady.max())) for k in range(1, 11)]
     block = max(1, 10 * int(np.diff(tenths).min()) // _OF_RAMP)
-    if record.time is None or 2 * block > size:
+    if impact or record.time is None or 2 * block > size:
         return record, size
     while (moving := _moving(record, block)).sum() > _MOST_BLOCKS and block < size:
         block *= 2

@@ -81,7 +81,6 @@ def condition(
     still = [] if impact else repair.find_standstills(record)
     record = repair.bridge_standstills(repair.fill_staircase(record), still, specimen.height)
     excess = record.excess
-    record = contact.first_contact(record) if impact else record
     found = [] if impact else cycles.find_cycles(record)
     chosen = cycles.choose_cycles(found, window.cycle, window.last)
     used = chosen or cycles.Cycle(number=1, place=0, first=0, top=0, end=len(record), turn=0)
@@ -115,7 +114,7 @@ def condition(
     else:
         record = replace(record, acceleration=None)
     whole = checks(record, specimen, given, several=used.last is not None)
-    whole, block = (whole, blocks.usual(len(whole))) if impact else blocks.without_holds(whole)
+    whole, block = blocks.without_holds(whole, impact=impact)
     record = blocks.thin(whole, block)
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
@@ -177,6 +176,7 @@ def _contact_of_impact(
     record: Record, levels: contact.Levels, striker: Striker, *, late: bool
 ) -> tuple[Record, contact.Start, zeros.Span]:
     """Return the record of an impact without drift, its start of contact, and its rows to keep."""
+    record = contact.first_contact(record)
     start = contact.start_of_impact(record, levels, late=late)
     straight = zeros.without_drift(record, start, levels)
     if straight is not record:

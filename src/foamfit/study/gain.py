@@ -286,6 +286,15 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
     return out
 
 
+def no_worse(found: dict[str, Expected], now: dict[str, Expected]) -> dict[str, Expected]:
+    """Return what is expected after further tests, which take nothing away.
+
+    The draws may lie where less is determined than at the best point.
+    """
+    kept = {name for name, one in found.items() if now[name].state == "determined" != one.state}
+    return found | {name: now[name] for name in kept}
+
+
 @dataclass(frozen=True, eq=False)
 class Target:
     """A quantity of another impact that the foam is needed for, in each draw."""

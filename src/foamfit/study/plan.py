@@ -8,7 +8,7 @@ simulated with each draw, and the expected interval of a parameter is the median
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -43,12 +43,13 @@ from foamfit.study.gain import (
     expected,
     information,
     look,
+    no_worse,
     problem_for,
     rows_of,
     without_nuisance,
 )
 from foamfit.study.joint_result import JointResult
-from foamfit.study.saved import load
+from foamfit.study.saved import load, with_record
 from foamfit.text import counted
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
@@ -114,15 +115,7 @@ def plan(
     """
     tests, rivals = _read(results)
     rng, test = np.random.default_rng(seed), tests[0].problem.measurement
-    # A hold is worth a try if one of the laws relaxes.
-    relaxing = any(one.problem.model.relaxation for one in (tests[0], *rivals.values()))
-    limits = read_rig(None if rig is None else Path(rig), test, relaxing=relaxing)
-    asked = candidates(limits, test, len(tests[0].problem.model.kinds))
-    if not asked:
-        raise InputError(
-            f"{test.name}: no test to plan; give a rig with a [striker] or a [machine] "
-            "(foamfit init --rig RIG.toml writes a draft)"
-        )
+    limits, asked = _candidates(tests[0], rivals, rig)
     progress(0.0, "drawing what the tests leave open")
     known = known_of(tests, rng, DRAWS)
     others = {name: known_of([one], rng, 0) for name, one in rivals.items()}
@@ -137,7 +130,7 @@ def plan(
     def outcome(one: Candidate, *more: Seen) -> Outcome:
         risk = np.any([each.broken for each in more], axis=0)
         error = None if target is None else target.error(known, more)
-        found = _no_worse(expected(known, more), now)
+        found = no_worse(expected(known, more), now)
         if contradicted and one.drive == "impact":  # as in a fit, where the law errs as well
             found = {name: x.capped() for name, x in found.items()}
         return Outcome(one, float(np.mean(risk)), found, more[0].force, error, more[0].apart)
@@ -177,6 +170,22 @@ def plan(
 # ------------------------------------------------------------------ the tests at hand
 
 
+def _candidates(
+    first: Test, rivals: Mapping[str, Test], rig: str | Path | None
+) -> tuple[Rig, list[Candidate]]:
+    """Return the rig and its tests to choose from; InputError if there are none."""
+    test = first.problem.measurement
+    # A hold is worth a try if one of the laws relaxes.
+    relaxing = any(one.problem.model.relaxation for one in (first, *rivals.values()))
+    limits = read_rig(None if rig is None else Path(rig), test, relaxing=relaxing)
+    if asked := candidates(limits, test, len(first.problem.model.kinds)):
+        return limits, asked
+    raise InputError(
+        f"{test.name}: no test to plan; give a rig with a [striker] or a [machine] "
+        "(foamfit init --rig RIG.toml writes a draft)"
+    )
+
+
 def _as_fitted(tests: Sequence[Test]) -> dict[str, Any]:
     """Return the drives, and the spring parameters held elsewhere than by default, SI."""
     problem, drives = tests[0].problem, {one.problem.objective.drive for one in tests}
@@ -206,7 +215,7 @@ def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
         for fit in fits:
             if not isinstance(fit, FitResult):
                 raise InputError(f"{one} is not a fit or joint fit; name the folder of one")
-            fit = _with_record(fit, one) if isinstance(one, str | Path) else fit
+            fit = with_record(fit, one) if isinstance(one, str | Path) else fit
             problem = problem_of(fit)
             found.append(Test(problem, problem.vector(fit.params) - problem.origins, fit, study))
     if not found:
@@ -217,20 +226,6 @@ def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
     return same, {
         rung_name(x.problem.model.name, "none", x.problem.model.relaxation): x for x in rest
     }
-
-
-def _with_record(fit: FitResult, folder: str | Path) -> FitResult:
-    """Return a fit with the path of its record as found from the folder of the result.
-
-    A result names its record as the fit was given it, relative to the current directory of that
-    time, which usually contains the folder.
-    """
-    path = fit.measurement.path
-    if path is None:
-        return fit
-    places = (place / path for place in Path(folder).resolve().parents)
-    path = next((place for place in places if place.is_file()), path)
-    return replace(fit, measurement=replace(fit.measurement, path=path))
 
 
 def _published(name: str) -> Test:
@@ -392,15 +387,6 @@ def _with_open(
         if one.place in open_ and one.param is not None:
             point[j] = rng.uniform(*one.param.start_limits)
     return space.decode(point)
-
-
-def _no_worse(found: dict[str, Expected], now: dict[str, Expected]) -> dict[str, Expected]:
-    """Return what is expected after further tests, which take nothing away.
-
-    The draws may lie where less is determined than at the best point.
-    """
-    kept = {name for name, one in found.items() if now[name].state == "determined" != one.state}
-    return found | {name: now[name] for name in kept}
 
 
 def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:

@@ -9,7 +9,7 @@ import io
 import math
 import re
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -331,6 +331,19 @@ def _plain_numbers(table: Table, places: list[int]) -> Array | None:
     return numbers if complete else None
 
 
+def _of_header(table: Table, row: int, cells: Sequence[str]) -> list[str]:
+    """Return the cells of a row, at least as many as the header has; others must be empty."""
+    count = len(table.headers)
+    out = [" ".join(cell.split()) for cell in cells] + [""] * (count - len(cells))
+    if tuple(out) == table.header_cells:
+        again = f"row {row} repeats the header of row {table.header_row}"
+        raise InputError(f"{again}; a file must contain one table with one header.")
+    if any(out[count:]):
+        wrong = f"row {row} has {len(out)} cells, but the header has {count}"
+        raise InputError(f"{wrong}; every row must have as many as the header.")
+    return out
+
+
 def _checked_numbers(
     table: Table, columns: dict[str, int]
 ) -> tuple[Array, Integers, list[Dropped]]:
@@ -339,18 +352,11 @@ def _checked_numbers(
     A row is no sample if it has a time at most, or if it is text below the table. Such text may
     contain a number, as in "Max force,23,N".
     """
-    numbers, rows, count = array("d"), array("q"), len(table.headers)
-    empty, remarks = list[int](), list[int]()
+    numbers, rows, empty, remarks = array("d"), array("q"), list[int](), list[int]()
     places, below = list(columns.values()), list[tuple[int, InputError]]()
     measured = [k for name, k in columns.items() if name != "time"] or places
     for row, cells in table.rows():
-        cells = [" ".join(cell.split()) for cell in cells] + [""] * (count - len(cells))
-        if tuple(cells) == table.header_cells:
-            again = f"row {row} repeats the header of row {table.header_row}"
-            raise InputError(f"{again}; a file must contain one table with one header.")
-        if any(cells[count:]):
-            wrong = f"row {row} has {len(cells)} cells, but the header has {count}"
-            raise InputError(f"{wrong}; every row must have as many as the header.")
+        cells = _of_header(table, row, cells)
         if all(cells[k].lower() in _MISSING for k in measured):
             filled = [cell for cell in cells if cell.lower() not in _MISSING]
             if len(filled) == 1 and _is_sample(re.split(r"[\s;|,]+", filled[0])):
