@@ -229,7 +229,7 @@ class Card:
 
 
 def _check_own(path: Path, beside: Path) -> None:
-    """Raise InputError if there is a file that is no card: FILE.json does not stand beside it."""
+    """Raise InputError if the file exists and is not a card, which has a FILE.json beside it."""
     if not path.is_file():
         return
     try:

@@ -14,8 +14,9 @@ _BLOCKS = 1000  # number of these blocks, at most, unless a ramp would have too 
 _OF_RAMP = 100  # blocks of the fastest ramp
 _MOST_BLOCKS = 10_000
 _LAG = _OF_RAMP // 10
-_MOVES = 0.005  # least change over so many blocks if they move, as a share of the range
-_BEYOND = 6.0  # standard deviations of noise above which they move
+# Blocks move if means of _LAG of them differ by more than this share of the range, and by more than
+# this many standard deviations of noise.
+_MOVES, _BEYOND = 0.005, 6.0
 
 
 def without_holds(record: Record, *, impact: bool = False) -> tuple[Record, int]:
@@ -26,11 +27,13 @@ def without_holds(record: Record, *, impact: bool = False) -> tuple[Record, int]
     """
     n = len(record)
     size = -(-n // _BLOCKS) if n > _MAX_ROWS else 1
+    if impact or record.time is None or size == 1:
+        return record, size
     values = record.stress if record.displacement is None else record.displacement
     steady = smooth(values, size // 2 + 1)
     tenths = [int(np.argmax(steady >= 0.1 * k * steady.max())) for k in range(1, 11)]
     block = max(1, 10 * int(np.diff(tenths).min()) // _OF_RAMP)
-    if impact or record.time is None or 2 * block > size:
+    if 2 * block > size:
         return record, size
     while (moving := _moving(record, block)).sum() > _MOST_BLOCKS and block < size:
         block *= 2

@@ -15,11 +15,11 @@ from foamfit.data.noise import MIN_REST, level_on_line, noise_about, smooth
 # the loading branches differ by a smaller factor (6 in the published sets), so a soft start is not
 # mistaken for rest. The limit is larger for a motion, and for an impact, whose fit refines it.
 STILL, _STILL_IMPACT, STILL_MOTION = 0.15, 0.3, 0.5
-# Largest deviation of a rest from its line, as a share of the range of a stress or a motion: the
-# hold of a step or of a preload is no rest.
+# Largest deviation of a rest from its line, as a share of the range of a stress or a motion. A hold
+# after a step or a preload deviates more.
 _WANDERS, _MOTION_WANDERS = 0.01, 0.025
 _STRAIGHT = 0.005  # RMS deviation of a motion from a line, as a share of its range
-_LINE = 5  # least rows of a line
+_LINE = 5  # smallest number of rows for a line
 _ERRORS = 2.0  # standard errors added to the slope at rest
 # Largest drift of an impact's stress at rest, as a share of the peak: without a motion; if the
 # motion starts at zero (a rising stress is then contact); and if it starts away from zero, unless
@@ -173,7 +173,7 @@ def _at_kink(channel: str, time: Array, at: Kink, by: str, what: str = "rest") -
 
 
 def straight(time: Array, w: Array, first: int, rows: int, noise: NoiseLevel) -> int:
-    """Return how many of some rows a motion keeps to a line; it may soon stop for a hold."""
+    """Return the number of rows, at most `rows`, in which a motion follows a straight line."""
     most = max(3.0 * noise.sigma, _STRAIGHT * float(np.ptp(w)))
     while rows > _LINE:
         t, y = time[first : first + rows] - time[first], w[first : first + rows]
@@ -202,10 +202,10 @@ def first_contact(record: Record) -> Record:
     share = (stress - free) / max(float(stress.max()) - free, 1e-300)
     edges = np.flatnonzero(np.diff(np.concatenate(([False], share > _AGAIN, [False]))))
     begins, ends = edges[::2], edges[1::2]
-    for end, begin in zip(ends[:-1], begins[1:], strict=True):
+    flights = begins[1:] - ends[:-1] > 2 * (ends - begins).max()
+    for end, begin in zip(ends[:-1][flights], begins[1:][flights], strict=True):
         before, after = (float(part.clip(0.0).sum()) for part in (share[:begin], share[begin:]))
-        is_first = share[:end].max() >= 0.5 and before >= 0.5 * after
-        if is_first and begin - end > 2 * (ends - begins).max():
+        if share[:end].max() >= 0.5 and before >= 0.5 * after:
             why = "after the first contact, as the striker comes back"
             return record.without(slice((end + begin) // 2, None), why).noted(
                 "The striker comes back after its rebound; only the first contact is used."

@@ -68,11 +68,9 @@ class Scales:
                 least = min(1.0, _RAMPS * 10.0 * float(gaps.min()) / lasts)
         return cls(float(np.max(measurement.stress)), strain, rate, height, least)
 
-    def limits(self, param: Param) -> tuple[float, float]:
-        """Return the limits of the coordinate of a parameter."""
-        low, high = param.limits
-        is_time = param.scale == "duration" and param.is_logarithmic
-        return (low + math.log(self.least_time) if is_time else low), high
+    def least(self, param: Param) -> float:
+        """Return the factor of the lower limit of a parameter, below 1 for relaxation times."""
+        return self.least_time if param.scale == "duration" and param.is_logarithmic else 1.0
 
     @property
     def slope(self) -> float:
@@ -223,7 +221,8 @@ class Space:
                 ends = 0.0, self.scales.unit(param.scale)
                 between = param.coordinate if isinstance(param.coordinate, Between) else ends
                 short = split_name(name)[1]
-                log, bounds, limits = param.is_logarithmic, (low, high), self.scales.limits(param)
+                log, bounds, (least, most) = param.is_logarithmic, (low, high), param.limits
+                limits = least + math.log(self.scales.least(param)), most
                 out.append(Coordinate(at, short, param, limits, bounds, between, of, log))
         return out
 

@@ -185,6 +185,11 @@ def driving_stress(
     return np.maximum(stress, 0.0) if "unilateral" in model.kinds else stress
 
 
+def history(measurement: Measurement, model: Model) -> tuple[Array, Array] | None:
+    """Return times and motion of the cycles before, which a stress that relaxes remembers."""
+    return measurement.before if model.relaxation else None
+
+
 def shows_motion(stress: Array) -> NDArray[np.bool_]:
     """Return in which samples a driving stress shows the motion: from contact to its end."""
     loaded = np.flatnonzero(stress > LOADED * stress.max())

@@ -45,7 +45,7 @@ OF_DRIVE = ("those of the drive",)  # default of `Objective.nuisance`
 # law to measured foams have misfits above 1 %: a smaller noise must not let one channel outweigh
 # the other, as the residuals of both are then errors of the law.
 MODEL_ERROR = 0.005
-MOST_EXPLAINED = 1.5  # largest RMS residual over that of noise, as an estimated noise is uncertain
+MOST_EXPLAINED = 1.5  # ratio of the RMS residual to the expected noise up to which it is noise
 NORMAL = 1.4826  # standard deviation of normal residuals over their median absolute value
 RANKING = 1e-3  # allowed error of the simulations that rank starts on a thinned record
 THIN = 0.8  # a record is thinned if at most this fraction of its samples is left
@@ -220,7 +220,8 @@ class Objective:
         """
         uncertain = self.by_motion(values)
         if uncertain is None:
-            self.explained = self.measurement.striker is not None  # noise is in a smoothed pulse
+            # The moving parabola leaves noise in the pulse of an impact.
+            self.explained = self.measurement.striker is not None
             return False
         plain = self.plain(values)
         levels = [

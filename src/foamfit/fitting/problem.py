@@ -23,6 +23,7 @@ from foamfit.fitting.curves import (
     check_interior,
     choose_drive,
     default_weights,
+    history,
     replaces_striker,
 )
 from foamfit.fitting.objective import Objective
@@ -102,13 +103,13 @@ def make_params(
         param = model.param(name)
         value = param.start[0] * scales.unit(param.start[1])
         low, high = (bound * scales.unit(param.scale) for bound in param.bounds)
-        low *= scales.least_time if param.scale == "duration" else 1.0
+        low *= scales.least(param)
         vary = short != "eta" or (on_striker if spring < 0 else fast and count == 1)
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)
     late = nuisance.is_late(measurement, time_shift=time_shift)
     _add_nuisance(params, measurement, scales, drive, late)
-    if model.relaxation and measurement.before is not None and "displacement_zero" in params:
+    if history(measurement, model) is not None and "displacement_zero" in params:
         # A stress that relaxes may be gone above the strain at which the first contact was.
         params["displacement_zero"].min -= measurement.start_strain * measurement.specimen.height
     for name in params:  # a fifth of the upper end, where the ends are zero and other parameters

@@ -24,6 +24,7 @@ from foamfit.fitting.curves import (
     driven_instants,
     driving_motion,
     driving_stress,
+    history,
     instants,
     later,
     moved_at,
@@ -101,10 +102,11 @@ class Scenes:
         sampled = self.drive == "stress" and self.smooth is None
         self._fine = 1 if sampled else min(test.block, FINEST)
         self.clock = own = instants(self.time, self._fine, self.averaged)
+        self._earlier = 0  # number of instants before a later cycle
         if self.driven:
             self.clock = driven_instants(test, own, self.motion)
-            if self._earlier and test.before is not None:
-                self.clock = np.append(test.before[0], self.clock)
+            if (before := history(test, self.model)) is not None:
+                self.clock, self._earlier = np.append(before[0], self.clock), before[0].size
         self._own = np.searchsorted(self.clock, own) if self.clock.size > own.size else None
         driving = {"stress": ["stress_time"], "displacement": ["displacement_time"]}
         absent = driving.get(self.drive, []) + ["stress_time"] * (test.time is None)
@@ -142,9 +144,8 @@ class Scenes:
         """The measured motion at the simulated instants, m."""
         assert self.measurement.displacement is not None
         moved = moved_at(self.clock, self.time, self.measurement.displacement, self.motion)
-        if self._earlier:
-            assert self.measurement.before is not None
-            moved[: self._earlier] = self.measurement.before[1]
+        if self._earlier and (before := history(self.measurement, self.model)) is not None:
+            moved[: self._earlier] = before[1]
         return moved
 
     @cached_property
@@ -160,14 +161,8 @@ class Scenes:
         zeros = {curve: channels.get(channel_of(curve), "") for curve in self.curves}
         return {curve: zero for curve, zero in zeros.items() if zero in self.nuisance}
 
-    @property
-    def _earlier(self) -> int:
-        """Number of instants before a later cycle, whose motion a stress that relaxes remembers."""
-        before = self.measurement.before
-        return before[0].size if self.driven and self.model.relaxation and before else 0
-
     def modes(self, smooth: SmoothMotion) -> Array:
-        """Return the modes of what drives at the simulated instants, (instants, m)."""
+        """Return the modes of the drive at the simulated instants; zero before a later cycle."""
         modes = smooth.modes(self.clock)
         modes[: self._earlier] = 0.0
         return modes

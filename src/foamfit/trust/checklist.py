@@ -43,7 +43,7 @@ BOUGHT = 0.02
 # The curves contradict a prior if they differ by more than this many standard deviations of both.
 AGAINST = 3.0
 ALONE = 60  # iterations of a descent without a prior
-ASIDE = 0.0, -0.2, 0.2  # relative changes of its value, which may lie in a minimum of its own
+ASIDE = 0.0, -0.2, 0.2  # relative changes of the parameter at its starts, to find other minima
 # The stress is gone below this share of its peak, and a specimen has recovered below this share of
 # the largest strain.
 GONE, RECOVERED = 0.02, 0.5

@@ -17,6 +17,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
+from foamfit.fitting.curves import history
 from foamfit.fitting.nuisance import shown_by
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import STOPPING, Freed, Tracker, descend, distinct, rank, squares
@@ -46,10 +47,9 @@ def held_by_record(problem: Problem, asked: Collection[str]) -> Problem:
 
     Those that the user has `asked` to vary stay free.
     """
-    objective = problem.objective
-    test = problem.measurement
+    objective, test = problem.objective, problem.measurement
     shown = shown_by(test, objective.drive, late=objective.time_shift)
-    if problem.model.relaxation and test.before is not None:  # the zero is that of the law
+    if history(test, problem.model) is not None:  # the stress may start above the zero
         shown.pop("displacement_zero", None)
     return problem.keeping({name: one for name, one in shown.items() if name not in asked})
 

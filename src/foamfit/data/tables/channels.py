@@ -16,7 +16,7 @@ from foamfit.data.tables.signs import negative_channels
 from foamfit.data.units import LARGEST
 from foamfit.errors import InputError
 
-_COPIES = 0.9  # share of those that equal it in all channels, from which they are copies
+_COPIES = 0.9  # share of these that equal it in all channels, above which rows were repeated
 _COARSE = 0.1  # share of rows with the stamp of the row before, from which a clock is coarse
 
 

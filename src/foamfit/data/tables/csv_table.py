@@ -292,7 +292,7 @@ def _is_words(cells: list[str]) -> bool:
 def read_numbers(
     table: Table, columns: dict[str, int]
 ) -> tuple[dict[str, Array], Integers, list[Dropped]]:
-    """Read columns without conversion; return numbers, row numbers, and rows that are no samples.
+    """Read columns without conversion; return the numbers, their rows, and the dropped rows.
 
     Times of day are converted to seconds. InputError names the first cell that is not a number.
     """
@@ -349,8 +349,8 @@ def _checked_numbers(
 ) -> tuple[Array, Integers, list[Dropped]]:
     """Read the columns (k, n) cell by cell; see `read_numbers`.
 
-    A row is no sample if it has a time at most, or if it is text below the table. Such text may
-    contain a number, as in "Max force,23,N".
+    A row is dropped if it contains at most a time, or if it is a remark below the table. A remark
+    may contain a number, as in "Max force,23,N".
     """
     numbers, rows, empty, remarks = array("d"), array("q"), list[int](), list[int]()
     places, below = list(columns.values()), list[tuple[int, InputError]]()
