@@ -176,13 +176,12 @@ def limits_of(
     prior, middle = priors_of(measurement, drive).get(name), values_of(measurement)[name]
     rise = None if prior is not None else shown_by(measurement, drive, late=late).get(name)
     if name == FORCE_SCALE and not _shows_force(measurement):
-        return middle, middle
-    if prior is not None:
+        reach = 0.0
+    elif prior is not None:
         reach = REACH * prior.sigma
         reach = min(reach, 0.9 * middle) if name in POSITIVE else reach
     elif rise is not None:
-        ends = rise.mean - REACH_OF_RISE * rise.sigma, rise.mean + REACH_OF_RISE * rise.sigma
-        return _within_height(name, measurement, min(*ends, middle), max(*ends, middle))
+        reach = REACH_OF_RISE * rise.sigma
     elif name in POSITIVE:
         reach = 0.9 * middle
     elif name in ZEROS:
@@ -190,18 +189,13 @@ def limits_of(
         reach = 0.0 if values is None else LARGEST_ZERO * float(np.ptp(values))
     else:
         reach = (LARGEST_CONTACT if name == CONTACT_TIME else LARGEST_SHIFT) * duration
-    latest = _latest_contact(measurement) if name == CONTACT_TIME else 0.0
-    return _within_height(name, measurement, middle - reach, middle + max(reach, latest))
-
-
-def _within_height(
-    name: str, measurement: Measurement, low: float, high: float
-) -> tuple[float, float]:
-    """Return the limits of a zero at which the measured strain stays below one."""
-    if name != "displacement_zero" or measurement.displacement is None:
-        return low, high
-    least = float(measurement.displacement.max()) - LARGEST_STRAIN * measurement.specimen.height
-    return min(max(low, least), 0.0), high
+    at = middle if rise is None else rise.mean
+    latest = _latest_contact(measurement) if name == CONTACT_TIME and rise is None else 0.0
+    low, high = min(at - reach, middle), max(at + reach, middle + latest)
+    if name == "displacement_zero" and measurement.displacement is not None:
+        least = float(measurement.displacement.max()) - LARGEST_STRAIN * measurement.specimen.height
+        low = min(max(low, least), 0.0)
+    return low, high
 
 
 def _shows_force(measurement: Measurement) -> bool:

@@ -382,8 +382,7 @@ class Objective:
         It is integrated along with the simulation, and zero if the simulation fails.
         """
         out = np.zeros((self.n_data + len(self.priors), places.size))
-        for row, (sigma, place) in enumerate(zip(self._sigmas, self._prior_places, strict=True)):
-            out[self.n_data + row, places == place] = 1.0 / sigma
+        out[self.n_data :] = (self._prior_places[:, None] == places) / self._sigmas[:, None]
         if not places.size:
             return out
         try:
@@ -392,9 +391,7 @@ class Objective:
             return out
         found = self._gathered(rows)
         slopes = found[1:].T
-        beyond = np.abs(found[0]) >= self.penalty
-        if beyond.any():
-            slopes[beyond] = 0.0
+        slopes[np.abs(found[0]) >= self.penalty] = 0.0
         out[: self.n_data] = slopes if self.weighing is None else self.weighing(slopes)
         return out
 

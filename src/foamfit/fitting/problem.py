@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import starmap
 from numbers import Real
 
 import lmfit
@@ -150,13 +151,16 @@ def check_fixed_and_varied(
     for name in (*fix, *vary):
         if name in ONLY_IMPACT and name not in names:
             raise InputError(f"'{name}' cannot be fixed or varied here: {ONLY_IMPACT[name]}")
-        if name not in names:
-            raise InputError(
-                f"parameter '{name}' is not one of the model {model}; "
-                f"its parameters are {', '.join(names)}"
-            )
+        _check_known(f"parameter '{name}'", name, model, names)
         if name in fix and name in vary:
             raise InputError(f"parameter '{name}' cannot be both fixed and varied; choose one")
+
+
+def _check_known(what: str, name: str, model: str, names: Iterable[str]) -> None:
+    """Raise InputError if a parameter is not among the `names` of those of a model."""
+    if name not in names:
+        its = ", ".join(names)
+        raise InputError(f"{what} is not one of the model {model}; its parameters are {its}")
 
 
 def _add_heights(params: lmfit.Parameters, measurement: Measurement, model: Model) -> None:
@@ -407,16 +411,6 @@ def _check_strain(params: lmfit.Parameters, measurement: Measurement) -> None:
         )
 
 
-def _prior(name: str, value: object, model: Model) -> nuisance.Prior:
-    """Read a prior of a parameter of a model."""
-    if name not in (*NUISANCE, *model.names):
-        raise InputError(
-            f"priors: {name} is not one of the model {model.name}; its parameters are "
-            f"{', '.join(model.names)}"
-        )
-    return prior_of(name, value)
-
-
 def prior_of(name: str, value: object) -> nuisance.Prior:
     """Read a prior of a spring parameter of any law: mean and standard deviation, or a text."""
     where = f"priors: {name}"
@@ -476,21 +470,19 @@ def make_problem(
         interior_mass = False
     chosen = default_weights(measurement, drive, count) if weights is None else dict(weights)
     time_shift = nuisance.is_late(measurement, time_shift=time_shift)
+    for name in [name for name in priors or {} if name not in NUISANCE]:
+        _check_known(f"priors: {name}", name, model.name, model.names)
+    given = tuple(starmap(prior_of, (priors or {}).items()))
     objective = Objective(
-        measurement, model, drive, chosen,
-        interior_mass=interior_mass, time_shift=time_shift,
-        given=tuple(_prior(name, value, model) for name, value in (priors or {}).items()),
+        measurement, model, drive, chosen, interior_mass=interior_mass, time_shift=time_shift,
+        given=given,
     )  # fmt: skip
     measurement = objective.measurement  # it has the noise of each channel
     wanted = make_params(measurement, model, drive, time_shift=time_shift)
     params = lmfit.Parameters() if params is None else _copied(params)
-    if unknown := [name for name in params if name not in wanted]:
-        raise InputError(
-            f"parameter '{unknown[0]}' is not one of the model {model.name}; "
-            f"its parameters are {', '.join(wanted)}"
-        )
     limits = {name: (one.min, one.max) for name, one in wanted.items() if name in NUISANCE}
     for name in params:
+        _check_known(f"parameter '{name}'", name, model.name, wanted)
         wanted[name] = params[name]
     for name, (low, high) in limits.items():
         if wanted[name].vary and not math.isfinite(wanted[name].max - wanted[name].min):

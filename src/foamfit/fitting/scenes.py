@@ -170,10 +170,8 @@ class Scenes:
     def moved_by(self, change: Array | float) -> Scenes:
         """Return the scenes with a changed driving motion."""
         other = copy(self)
-        other.plans = {
-            damped: plan._replace(values=plan.values + change)
-            for damped, plan in self.plans.items()
-        }
+        pairs = self.plans.items()
+        other.plans = {key: plan._replace(values=plan.values + change) for key, plan in pairs}
         return other
 
     def _loading(self) -> Drive:
@@ -247,13 +245,12 @@ class Scenes:
         curves, motion = self._curves(springs, at, wanted, counted, everything)
         if not wanted.others:
             return curves, motion
-        out = {name: np.empty((1 + wanted.size, rows.shape[1])) for name, rows in curves.items()}
-        own = wanted.own.size
-        for name, rows in curves.items():
-            out[name][0], out[name][1 + wanted.own] = rows[0], rows[1 : 1 + own]
-        for row, name in wanted.others:
-            for curve, rows in curves.items():
-                out[curve][1 + row] = self._by_nuisance(name, curve, rows, at, wanted)
+        out = dict[str, Array]()
+        for curve, rows in curves.items():
+            out[curve] = every = np.empty((1 + wanted.size, rows.shape[1]))
+            every[0], every[1 + wanted.own] = rows[0], rows[1 : 1 + wanted.own.size]
+            for row, name in wanted.others:
+                every[1 + row] = self._by_nuisance(name, curve, rows, at, wanted)
         return out, motion
 
     def _by_nuisance(
@@ -405,9 +402,8 @@ class Scenes:
         out = np.array([read(row, late) for row in rows])
         if column is not None:
             step = STEP_OF_TIME * float(np.median(np.diff(self.time)))
-            out[1 + column] = (read(rows[0], late + step) - read(rows[0], late - step)) / (
-                2.0 * step
-            )
+            before, after = (read(rows[0], late + side) for side in (-step, step))
+            out[1 + column] = (after - before) / (2.0 * step)
         return out
 
     def _acceleration(

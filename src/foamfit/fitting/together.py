@@ -29,8 +29,6 @@ from foamfit.springs.parameters import NUISANCE
 ENOUGH, ITERATIONS = 1e-5, 80
 # Number of blocks of a curve; noise averages out in each, so that an error of the law shows.
 BLOCKS = 50
-# Largest number of tests whose own values are tried as start values for all tests.
-MOST_STARTS = 4
 # Least value whose logarithm is taken, and the largest logarithm.
 _TINY, _FAR = 1e-30, 100.0
 
@@ -52,21 +50,13 @@ class Rate:
         return v * f, f, v * slope
 
 
-@dataclass(frozen=True)
-class Pull:
-    """The residual between a scattering parameter of one test and its common value."""
-
-    place: int  # Index in the vector of parameters
-    common: int  # Index of the coordinate ln(common value)
-    weight: float  # Square root of the weight
-
-
 @dataclass(frozen=True, eq=False)
 class Term:
     """One test in a sum of squares.
 
     `places` are the indices of its coordinates (in the box `space`) among all coordinates. The
-    slope b of a rate law follows directly after the value at rate0.
+    slope b of a rate law follows directly after the value at rate0. Each scattering parameter has
+    a residual, its pull: its logarithm minus that of the common value, times `weights`.
     """
 
     objective: Objective
@@ -74,18 +64,20 @@ class Term:
     names: tuple[str, ...]  # Parameter of each coordinate
     places: NDArray[np.intp]
     rates: tuple[Rate, ...]
-    pulls: tuple[Pull, ...]
+    pulled: NDArray[np.intp]  # Indices of the scattering parameters in the vector of parameters
+    commons: NDArray[np.intp]  # Indices of the coordinates ln(common value)
+    weights: Array
 
     @property
     def size(self) -> int:
         """Number of residuals of the test, including priors and pulls."""
-        return self.objective.n_data + len(self.objective.priors) + len(self.pulls)
+        return self.objective.n_data + len(self.objective.priors) + self.pulled.size
 
     @cached_property
     def all_places(self) -> NDArray[np.intp]:
         """Indices of all coordinates on which the residual depends."""
         slopes = [self.places[rate.at] + 1 for rate in self.rates]
-        return np.array([*self.places, *slopes, *(pull.common for pull in self.pulls)], np.intp)
+        return np.array([*self.places, *slopes, *self.commons], np.intp)
 
     def _at(self, point: Array) -> tuple[Array, Array]:
         """Return the point of the test's box, and its derivative by `all_places`."""
@@ -107,23 +99,18 @@ class Term:
         found = self.objective.residual(values)
         if self.objective.failures > failures:
             found = np.full(found.size, np.inf)
-        off = [
-            pull.weight * (_logarithm(values[pull.place]) - point[pull.common])
-            for pull in self.pulls
-        ]
-        return np.append(found, off) if off else found
+        off = self.weights * (_logarithm(values[self.pulled]) - point[self.commons])
+        return np.append(found, off)
 
     def jacobian_at(self, point: Array) -> Array:
         """Return the derivative of `residual_at` by the coordinates in `all_places`, (n, c)."""
         own, through = self._at(point)
         values = self.space.decode(own)
         moves = self.space.slopes(own, values) @ through
-        rows = np.zeros((len(self.pulls), moves.shape[1]))
-        first = self.places.size + len(self.rates)
-        for j, pull in enumerate(self.pulls):
-            if abs(value := values[pull.place]) > _TINY:
-                rows[j] = pull.weight * moves[pull.place] / value
-                rows[j, first + j] -= pull.weight
+        seen = np.abs(pulled := values[self.pulled]) > _TINY
+        rows = moves[self.pulled] / np.where(seen, pulled, 1.0)[:, None]
+        rows[:, own.size + len(self.rates) :] -= np.eye(pulled.size)
+        rows *= np.where(seen, self.weights, 0.0)[:, None]
         return np.vstack([self.objective.jacobian_along(values, moves), rows])
 
 
@@ -154,8 +141,11 @@ class Together:
         own = _varying(problems)
         return cls(tuple(problems), Links({}), (), own, tuple(values), costs, {})
 
-    def starts(self, most: int = MOST_STARTS) -> list[list[Array]]:
-        """Return start values for other links: these values, and the values of one test for all."""
+    def starts(self, most: int) -> list[list[Array]]:
+        """Return start values for other links: these values, and those of one test for all.
+
+        `most` is the largest number of tests whose values are tried for all.
+        """
         count = len(self.values)
         chosen = np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
         pairs = list(zip(self.problems, self.values, strict=True))
@@ -221,15 +211,12 @@ def fit_linked(
     start can be simulated.
     """
     layout = _Layout.of(tuple(problems), links)
-    ends = list[levenberg.Iterate]()
-    for vectors in starts:
-        start = layout.start(vectors)
-        if np.all(np.isfinite(layout.residual(start))):
-            ends.append(
-                levenberg.descend(
-                    layout.residual, layout.jacobian, start, layout.box, iterations, enough=ENOUGH
-                )
-            )
+    functions = layout.residual, layout.jacobian
+    ends = [
+        levenberg.descend(*functions, start, layout.box, iterations, enough=ENOUGH)
+        for start in map(layout.start, starts)
+        if np.all(np.isfinite(layout.residual(start)))
+    ]
     if not ends:
         raise SimulationError(
             f"{problems[0].measurement.name}: no start of the fit of {len(problems)} tests can be "
@@ -239,7 +226,7 @@ def fit_linked(
     parts = np.split(best.residual, np.cumsum([term.size for term in layout.terms])[:-1])
     values = tuple(term.values(best.point) for term in layout.terms)
     costs = tuple(
-        float(np.sum(part[: part.size - len(term.pulls)] ** 2))
+        float(np.sum(part[: part.size - term.pulled.size] ** 2))
         for part, term in zip(parts, layout.terms, strict=True)
     )
     shared, common = layout.shared, layout.common(best.point, values)
@@ -339,13 +326,12 @@ class _Layout:
                 count += name in own
                 if kinds[name] in RATES:
                     rates.append(Rate(j, kinds[name], links.x(t), one.is_logarithmic))
-            pulls = tuple(
-                Pull(problem.index[name], places[name], float(pull[t]))
-                for name, pull in links.pulls.items()
-                if name in places and name in problem.free() and pull[t]
-            )
-            named, at_all = tuple(coordinates), np.array(at, np.intp)
-            terms.append(Term(problem.objective, space, named, at_all, tuple(rates), pulls))
+            free = places.keys() & problem.free()
+            pulls = {n: pull[t] for n, pull in links.pulls.items() if n in free and pull[t]}
+            pulled = np.array([problem.index[name] for name in pulls], np.intp)
+            commons = np.array([places[name] for name in pulls], np.intp)
+            given = problem.objective, space, tuple(coordinates), np.array(at, np.intp)
+            terms.append(Term(*given, tuple(rates), pulled, commons, np.array([*pulls.values()])))
         box = np.full(count, -_FAR), np.full(count, _FAR)
         for term in terms:
             for side, ends, steepest in zip(
@@ -382,8 +368,8 @@ class _Layout:
         for name, place in self.common_places.items():
             free = [t for t, problem in enumerate(self.problems) if name in problem.free()]
             if name in self.own:
-                values = (vectors[t][self.problems[t].index[name]] for t in free)
-                point[place] = np.median([_logarithm(value) for value in values])
+                values = [vectors[t][self.problems[t].index[name]] for t in free]
+                point[place] = np.median(_logarithm(np.array(values)))
                 continue
             columns = [self.terms[t].names.index(name) for t in free]
             own = np.array([found[t][j] for t, j in zip(free, columns, strict=True)])
@@ -413,9 +399,9 @@ class _Layout:
         return out
 
 
-def _logarithm(value: float) -> float:
-    """Return the logarithm of the absolute value of a parameter."""
-    return float(np.log(max(abs(value), _TINY)))
+def _logarithm(values: Array) -> Array:
+    """Return the logarithms of the absolute values of parameters."""
+    return np.log(np.maximum(np.abs(values), _TINY))
 
 
 def _parents(problem: Problem, name: str) -> set[str]:

@@ -94,20 +94,11 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
     steps = np.where(np.abs(steps) > rounding, steps, 0.0) * best.sizes
     moves = problem.moves(best.values, best.names)
     change = (0.5 * (high - low) + moves @ steps) * (share / step)
-    return np.asarray(change + _of_origin(best, quantity, share))
-
-
-def _of_origin(best: BestPoint, quantity: str, share: float) -> Array:
-    """Return the change of the zeros in the file, to which the fitted ones are added, (n_values,).
-
-    The zero of a channel scales with the channel.
-    """
-    problem, out = best.problem, np.zeros(best.values.size)
     zero, power = _OF_ZEROS.get(quantity, ("", 0.0))
     if zero in best.index and (quantity != "striker_mass" or problem.measurement.braked):
-        place = best.index[zero]
-        out[place] = power * share * problem.origins[place]
-    return out
+        # The zero in the file, to which the fitted one is added, scales with its channel.
+        change[best.index[zero]] += power * share * problem.origins[best.index[zero]]
+    return np.asarray(change)
 
 
 def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array]:

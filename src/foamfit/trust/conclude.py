@@ -55,15 +55,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
     problem, objective, simulated = best.problem, best.problem.objective, best.simulated
     measurement, specimen = problem.measurement, problem.measurement.specimen
     intervals = Intervals() if intervals is None else intervals
-    insight = correlation = None
-    if best.names:
-        spread = best.spread
-        noise = {  # one standard deviation per curve, enlarged by the autocorrelation
-            name: math.sqrt(max(process.variance * process.tau, 1e-300)) / objective.factor(name)
-            for name, process in zip(objective.counted, spread.noise, strict=True)
-        }
-        insight = look(best, noise)
-        correlation = _correlation(best)
+    insight, correlation = (look(best), _correlation(best)) if best.names else (None, None)
     if record.stopped is not None and best.names and best.misfits:
         warnings = (*intervals.warnings, say("interval", "stopped"))
         intervals = replace(intervals, ranged=False, warnings=warnings)

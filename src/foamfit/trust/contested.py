@@ -45,29 +45,24 @@ def unsettled(best: BestPoint, found: Sequence[Contradiction]) -> tuple[Contradi
 
     Of a time shift, only what the fit leaves of it.
     """
-    problem, values = best.problem, dict(zip(best.problem.names, best.values.tolist(), strict=True))
-    known = {prior.name for prior in problem.objective.priors}
-    free, usual = set(problem.free()) - known, problem.objective.usual
-    ratios = {name: values.get(name, usual[name]) / usual[name] for name in nuisance.POSITIVE}
-    speed = ratios[nuisance.VELOCITY]
-    force = ratios[nuisance.FORCE_SCALE] / ratios[nuisance.STRIKER_MASS]
+    problem, usual = best.problem, best.problem.objective.usual
+    values = usual | dict(zip(problem.names, best.values.tolist(), strict=True))
+    free = set(problem.free()) - {prior.name for prior in problem.objective.priors}
+    speed, mass, scale = (values[name] / usual[name] for name in nuisance.POSITIVE)
+    settling = {"velocity": (speed,), "force_scale": (scale / mass,)}
     # Between masses within the specimen the force is late without a fault of the clocks.
     inert = problem.objective.interior_mass and len(problem.model.kinds) > 1
-
-    late = values.get(nuisance.TIME_SHIFT, 0.0)
-    found = [
-        replace(one, ratio=one.ratio - late) if one.quantity == nuisance.TIME_SHIFT else one
-        for one in found
-    ]
-
-    def agrees(one: Contradiction) -> bool:
+    out = list[Contradiction]()
+    for one in found:
         if one.quantity == nuisance.TIME_SHIFT:
-            return inert or abs(one.ratio) <= one.limit
-        off = {"velocity": (speed,), "force_scale": (force,)}
-        wanted = off.get(one.quantity, (1.0 / speed, 1.0 / force))
-        return all(abs(one.ratio / ratio - 1.0) <= one.limit for ratio in wanted)
-
-    return tuple(one for one in found if not (one.is_settled(free) or agrees(one)))
+            one = replace(one, ratio=one.ratio - values[nuisance.TIME_SHIFT])
+            agrees = inert or abs(one.ratio) <= one.limit
+        else:
+            ratios = settling.get(one.quantity, (1.0 / speed, mass / scale))
+            agrees = all(abs(one.ratio / ratio - 1.0) <= one.limit for ratio in ratios)
+        if not (agrees or one.is_settled(free)):
+            out.append(one)
+    return tuple(out)
 
 
 def of_flight(best: BestPoint) -> tuple[Contradiction, ...]:
@@ -105,9 +100,9 @@ def settle(best: BestPoint, found: Sequence[Contradiction]) -> tuple[Settled, ..
         # A given motion needs no striker.
         way = {name: by for name, by in way.items() if impact or name not in nuisance.STRIKER}
         words = [say("contradiction", "way", name=name, by=by) for name, by in way.items()]
-        shares = {name: by - (name != nuisance.TIME_SHIFT) for name, by in way.items()}
-        moves = [response(best, name, share) for name, share in shares.items()]
-        moved = best.values + sum(moves)
+        moved = best.values.copy()
+        for name, by in way.items():
+            moved += response(best, name, by - (name != nuisance.TIME_SHIFT))
         fails = not np.all(np.isfinite(moved))
         out.append(Settled(listed(words) if words else "", None if fails else moved))
     return tuple(out)
@@ -121,15 +116,16 @@ def judged(
     `ends` is its 95 % interval in the numbers of the file; `state` are its state and reason without
     the contradiction.
     """
-    for one in settled if state[0] == "determined" else ():
-        there = None
-        if one.values is not None:
-            there = float((one.values + best.problem.origins)[best.index[name]])
+    if state[0] != "determined":
+        return state
+    at, zero = best.index[name], best.problem.measurement.origins.get(name, 0.0)
+    for one in settled:
+        there = None if one.values is None else float(one.values[at]) + zero
         if there is None or not ends[0] <= there <= ends[1]:
             return "weak", say("why", "contested", settled=one, there=there, unit=unit_of(name))
     # The law errs, and the contradiction, or a doubtful force in an impact, may be the reason.
     impact, test = best.problem.objective.drive == "impact", best.problem.measurement
-    if state[0] == "determined" and (best.problem.kept if impact else settled and best.misfits):
+    if best.problem.kept if impact else settled and best.misfits:
         clipped, zero = is_clipped(test), test.zeros.get("stress", 0.0)
         peak = 0.0 if test.stress is None else float(test.stress.max())
         if settled or clipped or zero > DOUBTFUL * peak:

@@ -61,8 +61,7 @@ class Covariance:
     @property
     def correlation(self) -> Array:
         """Correlation matrix, (k, k)."""
-        scale = self.stderr
-        return self.matrix / np.outer(scale, scale)
+        return self.matrix / np.outer(self.stderr, self.stderr)
 
 
 def _directions(rows: Array) -> tuple[Array, Array, Array]:
