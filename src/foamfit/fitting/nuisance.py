@@ -24,11 +24,7 @@ CONTACT_TIME, TIME_SHIFT = "contact_time", "time_shift"
 VELOCITY, STRIKER_MASS = "velocity", "striker_mass"
 FORCE_SCALE = "force_scale"  # true force over measured force
 # Zeros of the channels: the reading of a channel when the quantity is zero.
-ZEROS = {
-    "displacement_zero": "displacement",
-    "stress_zero": "stress",
-    "acceleration_zero": "acceleration",
-}
+ZEROS = {f"{channel}_zero": channel for channel in ("displacement", "stress", "acceleration")}
 STRIKER = (VELOCITY, STRIKER_MASS)
 POSITIVE = (*STRIKER, FORCE_SCALE)  # positive parameters, each of which is its own scale
 UNDER_DRIVE = {

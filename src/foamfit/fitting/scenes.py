@@ -371,10 +371,8 @@ class Scenes:
     def _averaged(self, motion: Motion, contact: float) -> Motion:
         """Return a simulated motion at the times of the samples."""
         if not self._plain:
-            motion = motion._replace(
-                displacement=self._sampled(motion.displacement),
-                base_stress=self._sampled(motion.base_stress),
-            )
+            moved, stress = self._sampled(motion.displacement), self._sampled(motion.base_stress)
+            motion = motion._replace(displacement=moved, base_stress=stress)
         if self._earlier:
             of_cycle = motion.switches[:, 0] > self.clock[self._earlier - 1]
             motion = motion._replace(switches=motion.switches[of_cycle])

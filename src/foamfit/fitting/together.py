@@ -148,9 +148,13 @@ class Together:
         """
         count = len(self.values)
         chosen = np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
-        pairs = list(zip(self.problems, self.values, strict=True))
-        one_for_all = ([p.with_springs(self.values[t], own) for p, own in pairs] for t in chosen)
+        one_for_all = ([p.with_springs(self.values[t], v) for p, v in self.pairs] for t in chosen)
         return [list(self.values), *one_for_all]
+
+    @property
+    def pairs(self) -> list[tuple[Problem, Array]]:
+        """Each test with its parameters."""
+        return list(zip(self.problems, self.values, strict=True))
 
     @cached_property
     def n_eff(self) -> int:
@@ -181,18 +185,12 @@ class Together:
     @cached_property
     def misfits(self) -> tuple[dict[str, float | None], ...]:
         """Misfit of each curve of each test, RMS over the measured range."""
-        return tuple(
-            problem.objective.misfit(problem.objective.simulate(values, everything=True))
-            for problem, values in zip(self.problems, self.values, strict=True)
-        )
+        pairs = [(problem.objective, values) for problem, values in self.pairs]
+        return tuple(one.misfit(one.simulate(values, everything=True)) for one, values in pairs)
 
     def value(self, name: str) -> list[float]:
         """Return the values of one parameter in the tests that have it."""
-        return [
-            float(values[problem.index[name]])
-            for problem, values in zip(self.problems, self.values, strict=True)
-            if name in problem.index
-        ]
+        return [float(values[p.index[name]]) for p, values in self.pairs if name in p.index]
 
 
 def fit_linked(
@@ -260,7 +258,7 @@ def _varying(problems: Sequence[Problem]) -> tuple[str, ...]:
     return tuple(name for name in (*first.model.names, *NUISANCE) if name in free)
 
 
-def _spaces(problems: Sequence[Problem], absolute: Sequence[str]) -> list[Space]:
+def _spaces(problems: Sequence[Problem], absolute: tuple[str, ...]) -> list[Space]:
     """Return the boxes of the tests, with common scales and limits."""
     every, spaces = [problem.scales for problem in problems], [one.space() for one in problems]
     scales = Scales(
@@ -273,16 +271,10 @@ def _spaces(problems: Sequence[Problem], absolute: Sequence[str]) -> list[Space]
     count = len(problems[0].model.names)  # limits of nuisance parameters differ
     low = np.min([space.low[:count] for space in spaces], axis=0)
     high = np.max([space.high[:count] for space in spaces], axis=0)
-    return [
-        replace(
-            space,
-            scales=scales,
-            absolute=tuple(absolute),
-            low=np.append(low, space.low[count:]),
-            high=np.append(high, space.high[count:]),
-        )
-        for space in spaces
-    ]
+    for i, one in enumerate(spaces):
+        ends = np.append(low, one.low[count:]), np.append(high, one.high[count:])
+        spaces[i] = replace(one, scales=scales, absolute=absolute, low=ends[0], high=ends[1])
+    return spaces
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,28 +295,23 @@ class _Layout:
         kinds = {name: links.kind(name) for name in names}
         own = tuple(name for name in names if kinds[name] in ("own", "scatter"))
         shared = {name for name in names if kinds[name] == "shared"}
-        absolute = [
-            name
-            for name in names
-            if name not in own
-            and (parents := _parents(problems[0], name) & set(names))
-            and (parents - shared or kinds[name] in RATES)
-        ]
+        rated = {name for name in names if kinds[name] in RATES}
+        parents = {n: _parents(problems[0], n) & set(names) for n in names if n not in own}
+        absolute = tuple(n for n, of in parents.items() if of - shared or (of and n in rated))
         places, count = dict[str, int](), 0
         for name in names:
             if kinds[name] != "own":
                 places[name] = count
-                count += 2 if kinds[name] in RATES else 1
+                count += 2 if name in rated else 1
         terms = list[Term]()
-        for t, (problem, space) in enumerate(
-            zip(problems, _spaces(problems, absolute), strict=True)
-        ):
+        pairs = zip(problems, _spaces(problems, absolute), strict=True)
+        for t, (problem, space) in enumerate(pairs):
             at, rates = list[int](), list[Rate]()
             coordinates = {problem.names[one.place]: one for one in space.coordinates}
             for j, (name, one) in enumerate(coordinates.items()):
                 at.append(count if name in own else places[name])
                 count += name in own
-                if kinds[name] in RATES:
+                if name in rated:
                     rates.append(Rate(j, kinds[name], links.x(t), one.is_logarithmic))
             free = places.keys() & problem.free()
             pulls = {n: pull[t] for n, pull in links.pulls.items() if n in free and pull[t]}
@@ -334,11 +321,11 @@ class _Layout:
             terms.append(Term(*given, tuple(rates), pulled, commons, np.array([*pulls.values()])))
         box = np.full(count, -_FAR), np.full(count, _FAR)
         for term in terms:
+            slopes = [term.places[rate.at] + 1 for rate in term.rates]
             for side, ends, steepest in zip(
                 box, term.space.box, (-STEEPEST, STEEPEST), strict=True
             ):
-                side[term.places] = ends
-                side[[term.places[rate.at] + 1 for rate in term.rates]] = steepest
+                side[term.places], side[slopes] = ends, steepest
         return cls(problems, links, own, places, tuple(terms), box)
 
     @property

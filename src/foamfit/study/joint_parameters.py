@@ -30,9 +30,9 @@ from foamfit.study.study_file import Study
 from foamfit.text import counted
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
+from foamfit.trust.budget import judged, settle, unsettled
 from foamfit.trust.checklist import POOR, UNACCEPTABLE, status_of, warnings_of
 from foamfit.trust.conclude import conclude, noise_of
-from foamfit.trust.contested import judged, settle, unsettled
 from foamfit.trust.covariance import Ends
 
 # Items of the checklist that apply only to a search.

@@ -30,7 +30,7 @@ from foamfit.springs.parameters import any_param, split_name, unit_of
 from foamfit.text import engineering, listed
 from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
-from foamfit.trust.budget import changed, make_budget
+from foamfit.trust.budget import Settled, changed, judged, make_budget, of_flight, settle, unsettled
 from foamfit.trust.checklist import (
     POOR,
     lost_height,
@@ -39,7 +39,6 @@ from foamfit.trust.checklist import (
     status_of,
     warnings_of,
 )
-from foamfit.trust.contested import Settled, judged, of_flight, settle, unsettled
 from foamfit.trust.covariance import Ends
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
