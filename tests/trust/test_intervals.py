@@ -36,8 +36,7 @@ from foamfit.results import Profile
 from foamfit.trust import intervals
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
-from foamfit.trust.intervals import Choice, assess
-from foamfit.trust.markov_chain import mcmc
+from foamfit.trust.intervals import Choice, assess, mcmc
 from foamfit.trust.profile import trace
 from foamfit.trust.residuals.noise_process import NoiseProcess, noise_processes
 

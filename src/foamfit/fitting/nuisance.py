@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from foamfit.data.cycles import cycles_of
-from foamfit.data.measurement import INTEGRATED, Measurement
+from foamfit.data.measurement import Measurement
 from foamfit.data.noise import lowest_mean
 from foamfit.springs.parameters import NUISANCE
 
@@ -102,12 +102,13 @@ def open_in(measurement: Measurement, drive: str, counted: Mapping[str, bool]) -
     """
     priors = priors_of(measurement, drive)
     known = {name for name in priors if counted.get(ZEROS.get(name, ""), True)} - {FORCE_SCALE}
+    moved = counted["displacement"]
     if drive == "impact":
-        moved = {"displacement_zero"} if counted.get("displacement", False) else set()
-        return frozenset({CONTACT_TIME} | moved | known)
-    elsewhere = measurement.origins.get("displacement_zero", 0.0) != 0.0
-    moved = {"displacement_zero"} if elsewhere or measurement.contact != "file" else set()
-    return frozenset(moved | known)
+        known.add(CONTACT_TIME)
+    else:
+        elsewhere = measurement.origins.get("displacement_zero", 0.0) != 0.0
+        moved = elsewhere or measurement.contact != "file"
+    return frozenset(known | {"displacement_zero"} if moved else known)
 
 
 def shown_by(measurement: Measurement, drive: str, *, late: bool = False) -> dict[str, Prior]:
@@ -171,9 +172,7 @@ def limits_of(
     """
     prior, middle = priors_of(measurement, drive).get(name), values_of(measurement)[name]
     rise = None if prior is not None else shown_by(measurement, drive, late=late).get(name)
-    if name == FORCE_SCALE and not _shows_force(measurement):
-        reach = 0.0
-    elif prior is not None:
+    if prior is not None:
         reach = REACH * prior.sigma
         reach = min(reach, 0.9 * middle) if name in POSITIVE else reach
     elif rise is not None:
@@ -192,13 +191,6 @@ def limits_of(
         least = float(measurement.displacement.max()) - LARGEST_STRAIN * measurement.specimen.height
         low = min(max(low, least), 0.0)
     return low, high
-
-
-def _shows_force(measurement: Measurement) -> bool:
-    """Return whether an impact shows the scale of its force: by a motion or an acceleration."""
-    moved = measurement.displacement is not None and measurement.motion != INTEGRATED
-    moved = moved and "displacement" not in measurement.derived
-    return "stress" not in measurement.derived and (moved or measurement.acceleration is not None)
 
 
 def _latest_contact(measurement: Measurement) -> float:

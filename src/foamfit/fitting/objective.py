@@ -128,6 +128,7 @@ class Objective:
             self.interior_mass, self.followed, self.averaged, self.glued,
         )  # fmt: skip
         self.time, self.usual = self.scenes.time, self.scenes.usual
+        self.driven = self.scenes.driven  # whether the measured motion drives the springs
         self.measured = self._measured()
         self.counted = tuple(name for name in self.measured if self.weights[name] > 0)
         if not self.counted:
@@ -205,11 +206,6 @@ class Objective:
     def motion(self) -> SmoothMotion | None:
         """The measured motion without its noise, or None; see `driving_motion`."""
         return self.scenes.motion
-
-    @property
-    def driven(self) -> bool:
-        """Whether the measured motion drives the springs."""
-        return self.scenes.driven
 
     def weigh_motion(self, values: Array) -> bool:
         """Weight the residuals by the uncertainty of the driving motion; False if it has none.

@@ -192,13 +192,14 @@ def _add_nuisance(
         "acceleration": measurement.acceleration is not None,
     }
     free = nuisance.open_in(measurement, drive, counted) | {nuisance.TIME_SHIFT}
+    shows_force = counted["stress"] and (counted["displacement"] or counted["acceleration"])
     usual = nuisance.values_of(measurement)
     for name in nuisance.names_of(drive, time_shift=late):
         low, high = nuisance.limits_of(name, measurement, drive, scales.duration, late=late)
         origin = measurement.origins.get(name, 0.0)
-        limits = {"min": low + origin, "max": high + origin} if low < high else {}
-        vary = name in free and low < high
-        params.add(name, value=usual[name] + origin, vary=vary, **limits)
+        open_ = low < high and (name != nuisance.FORCE_SCALE or shows_force)
+        limits = {"min": low + origin, "max": high + origin} if open_ else {}
+        params.add(name, value=usual[name] + origin, vary=name in free and open_, **limits)
 
 
 def _counted_from(

@@ -55,7 +55,6 @@ OF_NUISANCE = {
 class Wanted(NamedTuple):
     """Derivatives to return, by the places of their parameters in the flat vector."""
 
-    size: int
     own: Places  # rows of the derivatives by parameters of springs
     directions: Places  # of the solver: those of springs, then those of nuisance parameters
     others: tuple[tuple[int, str], ...]  # rows and names of nuisance parameters
@@ -225,7 +224,7 @@ class Scenes:
                 (self.model.directions[places[own]], np.reshape(given, (-1, 2)).astype(np.int64))
             )
             site = tuple(r for r, p in enumerate(places[own].tolist()) if p == len(names) - 1)
-            found = Wanted(places.size, own, directions, others, columns, damped, site)
+            found = Wanted(own, directions, others, columns, damped, site)
             self._asked[key] = found
         return found
 
@@ -247,7 +246,7 @@ class Scenes:
             return curves, motion
         out = dict[str, Array]()
         for curve, rows in curves.items():
-            out[curve] = every = np.empty((1 + wanted.size, rows.shape[1]))
+            out[curve] = every = np.empty((1 + places.size, rows.shape[1]))
             every[0], every[1 + wanted.own] = rows[0], rows[1 : 1 + wanted.own.size]
             for row, name in wanted.others:
                 every[1 + row] = self._by_nuisance(name, curve, rows, at, wanted)

@@ -8,9 +8,9 @@ rate law (`fitting.links`).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,21 +33,15 @@ BLOCKS = 50
 _TINY, _FAR = 1e-30, 100.0
 
 
-@dataclass(frozen=True)
-class Rate:
-    """A coordinate of one test that follows a rate law."""
+def _by_rate(
+    kind: str, x: float, logarithmic: bool, v: float, b: float
+) -> tuple[float, float, float]:
+    """Return a coordinate that follows a rate law, and its derivatives by v and b.
 
-    at: int  # Index among the coordinates of the test
-    kind: str  # One of `RATES`
-    x: float  # ln(rate/rate0) of the test
-    logarithmic: bool  # Whether the coordinate is the logarithm of the parameter
-
-    def value(self, v: float, b: float) -> tuple[float, float, float]:
-        """Return the coordinate and its derivatives by the coordinate v at rate0 and by b."""
-        f, slope = factor(self.kind, b, self.x)
-        if self.logarithmic:
-            return v + float(np.log(f)), 1.0, slope / f
-        return v * f, f, v * slope
+    v is the coordinate at rate0; it may be the logarithm of the parameter.
+    """
+    f, slope = factor(kind, b, x)
+    return (v + math.log(f), 1.0, slope / f) if logarithmic else (v * f, f, v * slope)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +57,8 @@ class Term:
     space: Space
     names: tuple[str, ...]  # Parameter of each coordinate
     places: NDArray[np.intp]
-    rates: tuple[Rate, ...]
+    # The rate laws of some coordinates, by their index; see `_by_rate`
+    rates: Mapping[int, Callable[[float, float], tuple[float, float, float]]]
     pulled: NDArray[np.intp]  # Indices of the scattering parameters in the vector of parameters
     commons: NDArray[np.intp]  # Indices of the coordinates ln(common value)
     weights: Array
@@ -76,17 +71,19 @@ class Term:
     @cached_property
     def all_places(self) -> NDArray[np.intp]:
         """Indices of all coordinates on which the residual depends."""
-        slopes = [self.places[rate.at] + 1 for rate in self.rates]
-        return np.array([*self.places, *slopes, *self.commons], np.intp)
+        return np.array([*self.places, *self.slopes, *self.commons], np.intp)
+
+    @property
+    def slopes(self) -> list[int]:
+        """Indices of the slopes of rate laws."""
+        return [int(self.places[at]) + 1 for at in self.rates]
 
     def _at(self, point: Array) -> tuple[Array, Array]:
         """Return the point of the test's box, and its derivative by `all_places`."""
         own = point[self.places]
         through = np.eye(own.size, self.all_places.size)
-        for j, rate in enumerate(self.rates):
-            at, slope = rate.at, own.size + j
-            found = rate.value(own[at], point[self.places[at] + 1])
-            own[at], through[at, at], through[at, slope] = found
+        for j, (at, law) in enumerate(self.rates.items(), own.size):
+            own[at], through[at, at], through[at, j] = law(own[at], point[self.places[at] + 1])
         return own, through
 
     def values(self, point: Array) -> Array:
@@ -306,26 +303,25 @@ class _Layout:
         terms = list[Term]()
         pairs = zip(problems, _spaces(problems, absolute), strict=True)
         for t, (problem, space) in enumerate(pairs):
-            at, rates = list[int](), list[Rate]()
+            at, rates = list[int](), dict[int, partial[tuple[float, float, float]]]()
             coordinates = {problem.names[one.place]: one for one in space.coordinates}
             for j, (name, one) in enumerate(coordinates.items()):
                 at.append(count if name in own else places[name])
                 count += name in own
                 if name in rated:
-                    rates.append(Rate(j, kinds[name], links.x(t), one.is_logarithmic))
+                    rates[j] = partial(_by_rate, kinds[name], links.x(t), one.is_logarithmic)
             free = places.keys() & problem.free()
             pulls = {n: pull[t] for n, pull in links.pulls.items() if n in free and pull[t]}
             pulled = np.array([problem.index[name] for name in pulls], np.intp)
             commons = np.array([places[name] for name in pulls], np.intp)
             given = problem.objective, space, tuple(coordinates), np.array(at, np.intp)
-            terms.append(Term(*given, tuple(rates), pulled, commons, np.array([*pulls.values()])))
+            terms.append(Term(*given, rates, pulled, commons, np.array([*pulls.values()])))
         box = np.full(count, -_FAR), np.full(count, _FAR)
         for term in terms:
-            slopes = [term.places[rate.at] + 1 for rate in term.rates]
             for side, ends, steepest in zip(
                 box, term.space.box, (-STEEPEST, STEEPEST), strict=True
             ):
-                side[term.places], side[slopes] = ends, steepest
+                side[term.places], side[term.slopes] = ends, steepest
         return cls(problems, links, own, places, tuple(terms), box)
 
     @property

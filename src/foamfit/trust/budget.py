@@ -43,12 +43,15 @@ _CONTACT = (nuisance.CONTACT_TIME, *nuisance.ZEROS)
 _STRIKER = (*nuisance.POSITIVE, nuisance.TIME_SHIFT)
 # Owner of each quantity in a test, and its field, which is also its source of uncertainty.
 _QUANTITIES = {
-    "height": ("specimen", "height"),
-    "area": ("specimen", "area"),
+    "height": ("specimen", "height"), "area": ("specimen", "area"),
     "specimen_mass": ("specimen", "mass"),
-    "striker_mass": ("striker", "mass"),
-    "velocity": ("striker", "velocity"),
-}
+    "striker_mass": ("striker", "mass"), "velocity": ("striker", "velocity"),
+}  # fmt: skip
+# Zero of a channel that scales with a quantity, and the power.
+_OF_ZEROS = {
+    "area": ("stress_zero", -1.0), "stress_scale": ("stress_zero", 1.0),
+    "striker_mass": ("stress_zero", 1.0), "displacement_scale": ("displacement_zero", 1.0),
+}  # fmt: skip
 
 
 def responses(best: BestPoint) -> dict[str, Array]:
@@ -64,13 +67,6 @@ def responses(best: BestPoint) -> dict[str, Array]:
         for quantity, sigma in measurement.uncertainties.items()
         if quantity not in free
     }
-
-
-# Zero of a channel that scales with a quantity, and the power.
-_OF_ZEROS = {
-    "area": ("stress_zero", -1.0), "stress_scale": ("stress_zero", 1.0),
-    "striker_mass": ("stress_zero", 1.0), "displacement_scale": ("displacement_zero", 1.0),
-}  # fmt: skip
 
 
 def _value(test: Measurement, quantity: str) -> float:

@@ -159,9 +159,8 @@ def _at_noise(best: BestPoint, intervals: Intervals) -> Check:
             large = ratio > most + 3.0 * math.sqrt(tau / (2.0 * size))
             seen.append({"name": name, "ratio": ratio, "source": source, "large": large})
     long, large = longest > STRUCTURED, any(one["large"] for one in seen)
-    answer = False if missed or long or large else None
-    if answer is None and has_noise and (seen or longest >= 1.05):
-        answer = True
+    known = has_noise and bool(seen or longest >= 1.05)
+    answer = False if missed or long or large else known or None
     facts: dict[str, Any] = {"seen": seen, "missed": missed, "tau": longest, "long": long}
     return _check("noise", answer, ranged=intervals.ranged, **facts)
 

@@ -84,9 +84,7 @@ class Insight:
         return float(errors[-1]), named
 
     def sentence(self) -> str:
-        """Name the least determined direction; "" without parameters."""
-        if not self.names:
-            return ""
+        """Name the least determined direction."""
         error, parts = self.weakest()
         joint, scale = listed(f"{name} ({part:+.2g})" for name, part in parts.items()), ""
         if len(parts) == 1:
