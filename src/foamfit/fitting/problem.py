@@ -84,14 +84,11 @@ def make_params(
         model = Model.parse(with_options(model, **options), relaxation)
     drive = choose_drive(measurement) if drive is None else drive
     scales = Scales.of(measurement)
-    if model.relaxation and measurement.time is None:
-        raise InputError(
-            f"{measurement.name}: relaxation needs a time column; give one, or leave relaxation out"
-        )
-    if measurement.time is None and (delayed := [law for law in model.laws if law.is_viscous]):
-        raise InputError(
-            f"{measurement.name}: the stress of '{delayed[0].kind}' needs a time column"
-        )
+    wanting = ["relaxation"] if model.relaxation else []
+    wanting += [f"the stress of '{law.kind}'" for law in model.laws if law.is_viscous]
+    if measurement.time is None and wanting:
+        end = "; give one, or leave relaxation out" if model.relaxation else ""
+        raise InputError(f"{measurement.name}: {wanting[0]} needs a time column{end}")
     params, count = lmfit.Parameters(), len(model.kinds)
     fast = drive == "impact"
     on_striker = fast and (count > 1 or balance(measurement).damping is not None)
@@ -293,10 +290,9 @@ class Problem:
 
     def holding(self, name: str, value: float) -> Problem:
         """Return the problem with a varied parameter fixed at a value; unchanged if it is fixed."""
-        if name not in self.free():
-            return self
         params = self.params.copy()
-        params[name].set(value=value, vary=False)
+        if name in self.free():
+            params[name].set(value=value, vary=False)
         return replace(self, params=params)
 
     def keeping(self, shown: Mapping[str, nuisance.Prior]) -> Problem:
@@ -363,27 +359,21 @@ class Problem:
 
 
 def _copied(params: lmfit.Parameters) -> lmfit.Parameters:
-    """Return a copy, as the caller's must not change; InputError if an expression has no value."""
+    """Return a copy, as the caller's must not change; InputError for a wrong expression."""
     try:
         own = params.copy()
         values = own.valuesdict()
     except (ArithmeticError, NameError, RecursionError, TypeError, ValueError) as error:
         raise InputError(f"an expression of params cannot be evaluated: {error}") from None
-    for name, value in values.items():
-        if own[name].expr and not np.isfinite(value):
-            raise InputError(f"the expression {name} = {own[name].expr} gives {value}")
-    return own
-
-
-def _check_expressions(params: lmfit.Parameters) -> None:
-    """Raise InputError for an expression with a nuisance parameter."""
-    for name, parameter in params.items():
-        used = {name, *re.findall(r"\w+", parameter.expr)} & {*NUISANCE} if parameter.expr else ()
-        if used:
+    for name, expression in ((name, one.expr) for name, one in own.items() if one.expr):
+        if not np.isfinite(values[name]):
+            raise InputError(f"the expression {name} = {expression} gives {values[name]}")
+        if used := {name, *re.findall(r"\w+", expression)} & {*NUISANCE}:
             raise InputError(
-                f"the expression {name} = {parameter.expr} has {min(used)}, which may be held "
+                f"the expression {name} = {expression} has {min(used)}, which may be held "
                 "where the record shows it; only parameters of springs may be in an expression"
             )
+    return own
 
 
 def _check_held(params: lmfit.Parameters) -> None:
@@ -495,7 +485,7 @@ def make_problem(
                     "has nothing that would show it; leave it fixed"
                 )
             wanted[name].set(min=low, max=high)
-    _check_expressions(wanted)
+
     _counted_from(wanted, measurement.origins, -1.0)
     _check_held(wanted)
     _check_strain(wanted, measurement)
