@@ -329,7 +329,7 @@ def _by_parameters(
     own = np.flatnonzero(np.diag(covariance) > 0.0)
     places = np.append(own, [aligning.index[name] for name in aligned]).astype(np.int64)
     slopes = objective.simulate(point, places=places).slopes
-    if not own.size or slopes is None:
+    if not own.size:
         return {}
     jacobian, out = objective.jacobian(point, places), dict[str, Array]()
     # With other parameters, the aligned nuisance parameters would change as well.

@@ -196,11 +196,6 @@ class BestPoint:
         """Student's t of the 95 % interval of each parameter, (k,)."""
         return np.array([covariance.half_width(1.0, freedom) for freedom in self.spread.freedom])
 
-    @property
-    def cuts(self) -> Array:
-        """Rise of the cost at the ends of each local 95 % interval, (k,)."""
-        return self.quantiles**2 * self.spread.inflation
-
     @cached_property
     def halves(self) -> Array:
         """Half of each local 95 % interval, (k,)."""
