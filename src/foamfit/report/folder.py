@@ -20,7 +20,7 @@ from foamfit.codec import plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, reason, replacing
 from foamfit.report.figures import TWO, write_both
-from foamfit.report.result_figures import figures_of
+from foamfit.report.plots import figures_of
 from foamfit.report.summary import render_report
 from foamfit.report.tables import numbers_of, parameters_tex, with_head
 from foamfit.results import SCHEMA, Fit

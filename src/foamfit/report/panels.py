@@ -93,21 +93,19 @@ def panels_of(result: Fit) -> list[Panel]:
         return None if result.misfit.get(curve) is None else fitted
 
     pushing = measured(c.time, c.measured_stress) + _fitted(c.time, c.stress)
-    moving = measured(c.time, c.measured_displacement, motion)
-    moving += _fitted(c.time, c.displacement)
-    fitted = compared("displacement_time", c.displacement)
-    off = _residual(c.time, c.measured_displacement, fitted)
-    for node, (seen, fitted) in c.interior.items():
-        moving += measured(c.time, seen, node=node) + _fitted(c.time, fitted, node)
+    moving, off = list[Line](), list[Line]()
+    for node, (seen, found) in {0: (c.measured_displacement, c.displacement), **c.interior}.items():
+        moving += measured(c.time, seen, motion, node) + _fitted(c.time, found, node)
+        fitted = found if node else compared("displacement_time", found)
         off += _residual(c.time, seen, fitted, node)
     loop = measured(strain, c.measured_stress, motion)
-    along = compared("stress_strain", c.stress_along)
     loop += _fitted(None if moved is None else moved / height, pushed)
     if strain is not None and c.stress_along is not None and not is_known(result):
         # Wide and pale below the others, because it coincides with them if the fit is good.
         pale = {"color": PALE, "lw": 3.2, "zorder": 2}
         loop.append(Line(strain, c.stress_along, "springs along measured strain", pale))
     pushed_off = _residual(c.time, c.measured_stress, compared("stress_time", c.stress))
+    along = compared("stress_strain", c.stress_along)
     looped_off = _residual(strain, c.measured_stress, along)
     panels = [
         Panel("stress-time", "time", "s", "stress", "Pa", pushing, pushed_off),
@@ -119,12 +117,15 @@ def panels_of(result: Fit) -> list[Panel]:
     return [panel for panel in panels if panel.lines]
 
 
+def _line(x: Array | None, y: Array | None, *look: Any) -> list[Line]:
+    """Return a curve with label, style, kind and node, or none if it is missing."""
+    return [] if x is None or y is None else [Line(x, y, *look)]
+
+
 def measured(
     x: Array | None, y: Array | None, motion: str = "measured", node: int = 0
 ) -> list[Line]:
     """Return a measured curve, or none if it is missing."""
-    if x is None or y is None:
-        return []
     label, mark, edge = "measured", "o", "0.6"
     if node:
         mark, edge = MARKS[(node - 1) % len(MARKS)], _colour(node)
@@ -132,23 +133,18 @@ def measured(
     elif motion != "measured":
         label, mark = f"measured, motion {motion}", "s"
     style = {"marker": mark, "mfc": "white", "mec": edge, "mew": 0.6, "ms": 3.4, "zorder": 3}
-    return [Line(x, y, label, style, "measured", node)]
+    return _line(x, y, label, style, "measured", node)
 
 
 def _residual(x: Array | None, y: Array | None, fitted: Array | None, node: int = 0) -> list[Line]:
-    if x is None or y is None or fitted is None:
-        return []
-    style = {"color": _colour(node), "lw": 0.7}
-    off = 100.0 * (fitted - y) / (float(np.ptp(y)) or 1.0)
-    return [Line(x, off, "_fitted − measured", style)]
+    gap = None if y is None or fitted is None else 100.0 * (fitted - y) / (float(np.ptp(y)) or 1.0)
+    return _line(x, gap, "_fitted − measured", {"color": _colour(node), "lw": 0.7})
 
 
 def _fitted(x: Array | None, y: Array | None, node: int = 0) -> list[Line]:
-    if x is None or y is None:
-        return []
-    style = {"ls": DASHES[(node - 1) % len(DASHES)] if node else "-", "lw": 0.9, "zorder": 4}
-    label = f"mass {node}" if node else "fitted"
-    return [Line(x, y, label, style | {"color": _colour(node)}, "fitted", node)]
+    dashes = DASHES[(node - 1) % len(DASHES)] if node else "-"
+    style = {"ls": dashes, "lw": 0.9, "zorder": 4, "color": _colour(node)}
+    return _line(x, y, f"mass {node}" if node else "fitted", style, "fitted", node)
 
 
 def _colour(node: int) -> str:
