@@ -253,7 +253,7 @@ class Inputs:
                 column.param.update(options=["", *headers], value="")
         self._filling = False
 
-    def add_column(self, channel: str, entry: Mapping[str, Any]) -> None:
+    def add_column(self, channel: str, entry: Mapping[str, Any], event: Any = None) -> None:
         """Enter an entry of [columns] into the further TOML."""
         try:
             self.rest.value = with_column(self.rest.value or "", channel, entry)

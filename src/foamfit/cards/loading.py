@@ -96,9 +96,7 @@ def fitted_rates(source: Source) -> list[float]:
     return [float(rates[at]) for at in np.unique(np.round(np.log(rates) / _SAME), True)[1]]
 
 
-def loading_curves(
-    source: Source, rates: Sequence[float], measured_to: float
-) -> tuple[Curves, bool]:
+def curves_at(source: Source, rates: Sequence[float], measured_to: float) -> tuple[Curves, bool]:
     """Return the loading curves at ascending rates, and whether curves of the law cross.
 
     Each curve starts at zero, rises strictly and is nowhere below that of a lower rate. For a rate
