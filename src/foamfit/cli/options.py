@@ -147,13 +147,6 @@ class Output:
         """Whether only failures and a result as JSON are printed."""
         return self.quiet or self.as_json
 
-    def check(self, *, without_report: bool = True) -> None:
-        """Reject --open with --json (a browser may print on stdout), or without a page to open."""
-        pageless = self.no_report and not without_report
-        if self.opening and (self.as_json or pageless):
-            given = "json" if self.as_json else "no-report"
-            raise InputError(f"--open and --{given} exclude each other; leave one of them out")
-
     def folder(self, default: Path, of: str | None = None) -> Path:
         """Return the result folder; InputError if it cannot be written.
 
@@ -223,8 +216,12 @@ def open_page(page: Path) -> None:
         say(f"foamfit: no browser could be opened; open {page} by hand", err=True)
 
 
-def output(folder: str, printed: str) -> Callable[[Command], Command]:
-    """Add the options of `Output` to a command; `folder` and `printed` complete its help."""
+def output(folder: str, printed: str, *, always_page: bool = False) -> Callable[[Command], Command]:
+    """Add the options of `Output` to a command; `folder` and `printed` complete its help.
+
+    --open is rejected with --json (a browser may print on stdout), and with --no-report unless the
+    command writes a page even so.
+    """
     options = together(
         option("--out", f"Result folder. Default: {folder}.", FILE),
         option("--no-report", "Write tables only: no reports and no figures."),
@@ -238,6 +235,9 @@ def output(folder: str, printed: str) -> Callable[[Command], Command]:
         @functools.wraps(command)
         def run(**given: Any) -> Any:
             wanted = Output(**{one.name: given.pop(one.name) for one in fields(Output)})
+            if wanted.opening and (wanted.as_json or (wanted.no_report and not always_page)):
+                other = "json" if wanted.as_json else "no-report"
+                raise InputError(f"--open and --{other} exclude each other; leave one of them out")
             return command(output=wanted, **given)
 
         return options(run)

@@ -53,9 +53,7 @@ def soft(text: str) -> str:
 def wrong(error: object) -> str:
     """Return an error as a paragraph, "" for none; unexpected errors are called defects."""
     text = str(error)
-    if isinstance(error, Exception) and not isinstance(
-        error, InputError | SimulationError | OSError
-    ):
+    if not isinstance(error, str | InputError | SimulationError | OSError):
         text = f"This is a defect of foamfit, please report it ({type(error).__name__}: {error})."
     return piece("paragraph", text, "error") if text else ""
 
