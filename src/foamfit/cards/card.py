@@ -24,9 +24,9 @@ from foamfit.fitting.curves import driving_motion
 from foamfit.parts import law_in_words
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, FITTED, SEEN, images
+from foamfit.report.folder import Result
 from foamfit.report.readable import readable_unit
 from foamfit.report.render import environment, sentences
-from foamfit.report.shown import Result
 from foamfit.results import Fit
 from foamfit.study.identified import read_source
 from foamfit.study.joint_result import JointResult

@@ -21,7 +21,7 @@ from foamfit.options import OPTIONS
 from foamfit.terminal import say, without_ctrl_c
 
 if TYPE_CHECKING:
-    from foamfit.report.shown import Result
+    from foamfit.report.folder import Result
 
 Command = Callable[..., Any]
 FILE, WHOLE, COUNT = click.Path(path_type=Path), click.IntRange(min=0), click.IntRange(min=1)

@@ -16,11 +16,10 @@ from foamfit.data.measurement import Measurement
 from foamfit.parts import OfLaw, ParameterEstimate
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, INSIDE, TWO, VERMILION
-from foamfit.report.folder import write_columns, write_json
+from foamfit.report.folder import Result, write_columns, write_json
 from foamfit.report.panels import Line, Panel, measured
 from foamfit.report.plots import panelled
 from foamfit.report.render import words
-from foamfit.report.shown import Result
 from foamfit.results import flags_of, stamp
 from foamfit.springs.model import Model
 from foamfit.text import percent
