@@ -6,6 +6,7 @@ import json
 import math
 import textwrap
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -219,14 +220,10 @@ class Card:
 
 def _check_own(path: Path, beside: Path) -> None:
     """Raise InputError if the file exists and is not a card, which has a FILE.json beside it."""
-    if not path.is_file():
-        return
-    try:
-        own = {"format", "curves"} <= json.loads(beside.read_bytes()).keys()
-    except (OSError, ValueError, AttributeError):
-        own = False
-    if not own:
-        raise InputError(f"{path} exists and is not a card of foamfit; choose another name")
+    with suppress(OSError, ValueError, AttributeError):
+        if not path.is_file() or {"format", "curves"} <= json.loads(beside.read_bytes()).keys():
+            return
+    raise InputError(f"{path} exists and is not a card of foamfit; choose another name")
 
 
 def draw(card: Card) -> Figure:

@@ -215,8 +215,7 @@ def by_slowest(curves: Curves, motion: Motion) -> Replay:
     """
     back = (motion.rate < 0.0) & ~motion.first
     load = curves.at(curves.stress, motion.strain, np.where(back, 0.0, motion.rate))
-    summed: Array = cumulative_trapezoid(load, motion.strain, initial=0)
-    work = np.maximum(summed, 0.0)
+    work: Array = np.maximum(cumulative_trapezoid(load, motion.strain, initial=0), 0.0)
     energy = np.where(back, _ratio(work, np.maximum.accumulate(work)), 1.0)
     return lambda unloading: unloading.share(energy) * load
 

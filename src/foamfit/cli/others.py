@@ -313,8 +313,7 @@ def predict(
     from foamfit.study import predict as study
 
     options.compile_solver(output.silent)
-    found = study.predict(result, measurement, **asked)
-    output.finish(found, folder / "prediction.png")
+    output.finish(study.predict(result, measurement, **asked), folder / "prediction.png")
 
 
 @main.command()
@@ -399,8 +398,7 @@ def card(result: Path, format: str, units: str, rates: str | None, out: Path | N
     cards.check(format, units, asked)
     source = read_source(result)
     file = out or Path("cards", f"{_named(result)}-{format}{cards.FORMATS[format][0]}")
-    folder = result if result.is_dir() else result.parent
-    if folder.resolve() in file.resolve().parents:
+    if (result if result.is_dir() else result.parent).resolve() in file.resolve().parents:
         raise InputError(
             f"{file} lies in a result folder, which may be replaced; choose another --out"
         )

@@ -106,17 +106,6 @@ class Window:
     def _saves(self) -> Any:
         """Return the buttons that save parts of a result."""
 
-        def cycle() -> int:
-            return int(self.report_of.value)
-
-        saves: dict[tuple[str, str], Callable[[], bytes]] = {
-            ("the result folder", "result.zip"): lambda: self.desk.zipped(),
-            ("the report", "report.html"): lambda: self._report().encode(),
-            ("the TOML", desks.SAVED_TOML): lambda: self.desk.toml,
-            ("the LS-DYNA card", "card.zip"): lambda: self.desk.card(cycle()),
-            ("the test plan", "plan.html"): lambda: self.desk.planned(cycle()),
-        }
-
         def save(what: str, name: str, content: Callable[[], bytes]) -> Any:
             return pn.widgets.FileDownload(
                 label=f"Save {what}",
@@ -127,10 +116,17 @@ class Window:
                 **ui.STYLE,
             )
 
-        return ui.grid([save(*one, content) for one, content in saves.items()], 11.0)
+        saves = [
+            save("the result folder", "result.zip", self.desk.zipped),
+            save("the report", "report.html", lambda: self._report().encode()),
+            save("the TOML", desks.SAVED_TOML, lambda: self.desk.toml),
+            save("the LS-DYNA card", "card.zip", lambda: self.desk.card(self.report_of.value)),
+            save("the test plan", "plan.html", lambda: self.desk.planned(self.report_of.value)),
+        ]
+        return ui.grid(saves, 11.0)
 
     def _report(self) -> str:
-        """Return the HTML report of the fit, or of the selected cycle."""
+        """Return the report of the fit, or of the selected cycle."""
         return (self.desk.fits[self.report_of.value] / "report.html").read_text(encoding="utf-8")
 
     # ------------------------------------------------------------------------------- beside
@@ -139,8 +135,7 @@ class Window:
         """Enable the Fit button: there is a test, the solver is compiled, and no fit is running."""
         compiled = self.first_use.done.done()
         self.compiling.object = "" if compiled else ui.piece("busy", COMPILING)
-        ready = self.desk.measurement is not None and compiled
-        self.run.disabled = not ready or self.desk.running
+        self.run.disabled = self.desk.measurement is None or not compiled or self.desk.running
 
     def _beside(
         self, pool: ThreadPoolExecutor, work: Callable[[], Any], then: Callable[[Any], None]
@@ -301,8 +296,7 @@ class Window:
 
         def make() -> Turning:
             self.first_use.done.result()
-            test = self.desk.measured(of.cycle, of.last_cycle)
-            made = Turning(test, model, values, **options)
+            made = Turning(self.desk.measured(of.cycle, of.last_cycle), model, values, **options)
             made.turn({})  # load the compiled code
             return made
 

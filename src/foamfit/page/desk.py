@@ -195,8 +195,7 @@ class Desk:
         folder = self.folder / f"fit-{self._fits}"
         toml = folder.with_suffix(".toml")  # the page may change it later
         toml.write_bytes(self.toml)
-        job = Job(self.csv, toml, folder, arguments)
-        self.worker = Worker(job)
+        self.worker = Worker(Job(self.csv, toml, folder, arguments))
         return self.worker
 
     @property
@@ -207,9 +206,7 @@ class Desk:
     @property
     def result(self) -> Path | None:
         """The folder of the last fit, if it has one."""
-        if self.worker is None or self.worker.ended != "":
-            return None
-        return self.worker.job.folder
+        return None if self.worker is None or self.worker.ended != "" else self.worker.job.folder
 
     @property
     def fits(self) -> dict[int, Path]:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from foamfit.cli.progress import APART, Watcher
 from foamfit.errors import InputError, SimulationError, as_signalled
+from foamfit.options import OPTIONS
 from foamfit.solve import cache
 from foamfit.solve.precompile import LOOPS, compile_solver
 from foamfit.springs import laws
@@ -168,7 +169,6 @@ class _Teller(Watcher):
 
     def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
         """Report the parameters and misfits of the best point so far."""
-        named = zip(problem.names, (values + problem.origins).tolist(), strict=True)
         self.news = replace(
             self.news,
             model=problem.model.name,
@@ -176,7 +176,7 @@ class _Teller(Watcher):
             drive=problem.objective.drive,
             cycle=problem.measurement.cycle,
             last_cycle=problem.measurement.last_cycle,
-            values=dict(named),
+            values=dict(zip(problem.names, (values + problem.origins).tolist(), strict=True)),
             misfit=misfit,
         )
         self._say()
@@ -191,7 +191,6 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
     import click
 
     from foamfit.cli.fit import fit as command
-    from foamfit.cli.options import Output
 
     # A browser must not name a law file, because law files are code.
     own = click.Command("fit", params=[one for one in command.params if one.name != "law"])
@@ -199,10 +198,8 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
         context = own.make_context("fit", ["TEST.csv", *arguments])
     except click.ClickException as error:
         raise InputError(error.format_message()) from None
-    others = {"test", "specimen", "force", "verbose", *Output.__dataclass_fields__} - {
-        "figure_width"
-    }
-    return {name: value for name, value in context.params.items() if name not in others}
+    kept = OPTIONS.keys() - {"specimen"} | {"figure_width"}
+    return {name: value for name, value in context.params.items() if name in kept}
 
 
 def _fitted(job: Job, teller: _Teller) -> tuple[str, str]:

@@ -371,8 +371,7 @@ def plot_comparison(
                 one.tests[test] = _drawn(row.fitted, row.unit, row.fitted.state)
                 one.references[test] = _drawn(row.reference, row.unit, comparison.reference)
     title = f"fitted and {comparison.reference} parameters"
-    figure = plot_parameters(title, tests, list(panels.values()), width=width)
-    return figures.save(figure, path)
+    return figures.save(plot_parameters(title, tests, list(panels.values()), width=width), path)
 
 
 def _drawn(p: ParameterEstimate, unit: str, state: str) -> ParameterEstimate:

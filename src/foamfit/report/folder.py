@@ -238,8 +238,7 @@ def is_written(path: Path, tests: Collection[str] = ()) -> bool:
     if path.is_symlink():
         return False
     if path.is_dir() and (re.fullmatch(r"cycle-\d+", path.name) or path.name in tests):
-        within = list(path.iterdir())
-        return all(inner.name in FILES["fit.json"] and is_written(inner) for inner in within)
+        return all(one.name in FILES["fit.json"] and is_written(one) for one in path.iterdir())
     return any(path.name in names for names in FILES.values()) and path.is_file()
 
 
@@ -249,8 +248,7 @@ def _content(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):  # neither UTF-8 nor JSON
         return {}
-    valid = isinstance(content, dict) and {"schema", "foamfit"} <= content.keys()
-    return content if valid else {}
+    return content if isinstance(content, dict) and {"schema", "foamfit"} <= content.keys() else {}
 
 
 def load_result(folder: str | Path) -> dict[str, Any]:

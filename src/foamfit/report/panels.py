@@ -105,8 +105,7 @@ def panels_of(result: Fit) -> list[Panel]:
         pale = {"color": PALE, "lw": 3.2, "zorder": 2}
         loop.append(Line(strain, c.stress_along, "springs along measured strain", pale))
     pushed_off = _residual(c.time, c.measured_stress, compared("stress_time", c.stress))
-    along = compared("stress_strain", c.stress_along)
-    looped_off = _residual(strain, c.measured_stress, along)
+    looped_off = _residual(strain, c.measured_stress, compared("stress_strain", c.stress_along))
     panels = [
         Panel("stress-time", "time", "s", "stress", "Pa", pushing, pushed_off),
         Panel("displacement-time", "time", "s", "displacement", "m", moving, off),

@@ -167,8 +167,7 @@ class Plan(Result, OfLaw):
 
         rows = []
         for one in self.outcomes:
-            asked = one.candidate
-            row: dict[str, Any] = {key: getattr(asked, key) for key in SETTINGS}
+            row: dict[str, Any] = {key: getattr(one.candidate, key) for key in SETTINGS}
             row |= {"breaks": one.breaks, "determined": one.number, "peak_force": one.force}
             row |= {"error": one.error} if self.quantity else {}
             row |= {f"told apart from {name}": x for name, x in one.apart.items()}
