@@ -46,12 +46,8 @@ def _width(context: click.Context, parameter: click.Parameter, value: str) -> st
 TEST = click.argument("test", metavar="TEST.csv", type=FILE)
 
 
-def _range(
-    context: click.Context, parameter: click.Parameter, text: str | None
-) -> tuple[int, int] | None:
+def _range(text: str) -> tuple[int, int]:
     """Return the first and the last cycle of --cycles."""
-    if text is None:
-        return None
     first, dash, last = (part.strip() for part in text.partition("-"))
     if not (dash and first.isdecimal() and last.isdecimal() and 0 < int(first) <= int(last)):
         raise click.BadParameter(f"'{text}' is not FIRST-LAST in that order, like 1-3.")
@@ -93,7 +89,7 @@ def _fixes(
 READ: dict[str, dict[str, Any]] = {
     "specimen": {"type": FILE},
     "cycle": {"type": str, "callback": _cycles},
-    "cycles": {"type": str, "callback": _range},
+    "cycles": {"type": _range},
     "fix": {"type": str, "multiple": True, "callback": _fixes},
     "vary": {"type": str, "multiple": True},
 }

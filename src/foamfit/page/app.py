@@ -23,7 +23,7 @@ from foamfit.page import desk as desks
 from foamfit.page import inputs as ui
 from foamfit.page.curves import Curves, misfits_text
 from foamfit.page.turning import Turning
-from foamfit.page.worker import FirstUse, News, parsed
+from foamfit.page.worker import FirstUse, News, Worker, parsed
 from foamfit.parts import law_in_words
 from foamfit.report.folder import load_result
 from foamfit.springs.model import Model
@@ -357,7 +357,7 @@ class Window:
         ended, news = worker.ended, worker.news
         if ended is not None:
             self._poll.stop()
-            self._ended()
+            self._ended(worker)
             return
         if news is self._shown and not worker.stopping:
             return
@@ -390,7 +390,7 @@ class Window:
         options |= {"relaxation": news.relaxation, "drive": news.drive}
         self._turn_model(news.model, news, news.values, **options)
 
-    def _ended(self) -> None:
+    def _ended(self, worker: Worker) -> None:
         """Show the result of the fit, or why it failed."""
         self._allow()
         self.stop.visible = False
@@ -399,8 +399,7 @@ class Window:
         if self.desk.result is None:
             self.ending.object = ui.wrong(self.desk.ending())
             return
-        assert self.desk.worker is not None
-        told, picture = self.desk.worker.told, self.desk.result / "cycles.png"
+        told, picture = worker.told, self.desk.result / "cycles.png"
         self.ending.object = ui.soft(f"In a terminal: {self.desk.command}")
         if told:
             self.ending.object += ui.piece("verbatim", told)

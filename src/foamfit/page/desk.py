@@ -218,8 +218,7 @@ class Desk:
 
     def ending(self) -> str:
         """Return why the last fit has no result, or "" if it has one."""
-        assert self.worker is not None
-        return self._plain(self.worker.ended or "")
+        return self._plain((self.worker and self.worker.ended) or "")
 
     @property
     def command(self) -> str:
@@ -276,9 +275,6 @@ def safe_name(name: str) -> str:
     if not stem:
         stem, dot, suffix = name or "test", "", ""
     return f"{stem[: LONGEST - 10]}{dot}{suffix[:8]}"
-
-
-# ------------------------------------------------------------------------------------ the TOML
 
 
 def split_toml(text: str) -> tuple[dict[str, str], str]:

@@ -141,9 +141,6 @@ def recognised(test: str) -> str | None:
     return next(named, None)
 
 
-# ---------------------------------------------------------------- the sides
-
-
 @dataclass(frozen=True)
 class Side:
     """One side of a comparison: the parameters of a fit or of a published set."""
@@ -235,9 +232,6 @@ def published_side(name: str) -> Side:
     return Side(f"published {name}", Model.of_result(given), estimates, values, _GIVEN, item)
 
 
-# ---------------------------------------------------------------- one result, row by row
-
-
 def _pair(side: Side, other: Side) -> Pair:
     about: dict[str, Any] = {"side": side, "other": other}
     nothing = words("incomparable", **about)
@@ -327,9 +321,6 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
         ratio = replace(ratio, state=ratio.state if unknown else value.state)
         stated = None if item.damping_ratio is None else ParameterEstimate(item.damping_ratio)
         yield Row("ζ", "", ratio, stated, damping.remark)
-
-
-# ---------------------------------------------------------------- text and figure
 
 
 def comparison_text(comparison: Comparison) -> str:

@@ -267,9 +267,6 @@ def row_of(test: str, file: str, result: Fit) -> Row:
     return Row(test, file, result.status, error, misfit, runtime, result.parameters)
 
 
-# ------------------------------------------------------------------------------- the table
-
-
 def table_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return the rows of summary.csv in SI, one per test; None for missing values."""
     return [
@@ -328,9 +325,6 @@ def summary_words(rows: Sequence[Row]) -> str:
         more=max(len(wrong) - _MOST_REFUSALS, 0),
         parameters=parameters,
     )
-
-
-# ------------------------------------------------------------------------------- the page
 
 
 def write_comparison(

@@ -252,9 +252,6 @@ def _shade_standstills(ax: Axes, panel: Panel, result: Fit) -> None:
                 ax.plot(line.x[at] / fx, line.y[at] / fy, lw=7.0, solid_capstyle="butt", **style)
 
 
-# ---------------------------------------------------------------------------- names in a panel
-
-
 class _Labels:
     """Placement of names in a panel, away from other names, curves and marks."""
 
