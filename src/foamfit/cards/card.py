@@ -360,6 +360,5 @@ def check(format: str, units: str, rates: float | Iterable[float | str] | None) 
 
 
 def _rms(values: Iterable[float | None]) -> float | None:
-    """Return the root mean square of the values that are not None."""
     known = [value for value in values if value is not None]
     return float(np.sqrt(np.mean(np.square(known)))) if known else None

@@ -126,9 +126,8 @@ def folder_name(options: Mapping[str, Any]) -> str:
     parts = [options["model"]]
     for name in sorted(options.keys() - {"model"}, key=lambda one: ((*FIRST, one).index(one), one)):
         value, shown = options[name], name.replace("_", "-")
-        parts.append(shown if value is True else _words(value))
-        if value is not True and name not in BARE:
-            parts[-1] = f"{shown}-{parts[-1]}"
+        named = _words(value) if name in BARE else f"{shown}-{_words(value)}"
+        parts.append(shown if value is True else named)
     whole = re.sub(r"[^\w.,+=-]+", "-", "-".join(parts))
     mark = hashlib.sha256(whole.encode()).hexdigest()[:8]
     return whole if len(whole) <= LONGEST else f"{whole[: LONGEST - 9]}-{mark}"
@@ -140,8 +139,8 @@ def _words(value: Any) -> str:
         return ",".join(f"{key}={_words(one)}" for key, one in sorted(value.items()))
     if isinstance(value, list):
         return ",".join(map(_words, value))
-    exact = not isinstance(value, float) or float(f"{value:g}") == value
-    return f"{value:g}" if isinstance(value, float) and exact else str(value)
+    short = isinstance(value, float) and float(f"{value:g}") == value
+    return f"{value:g}" if short else str(value)
 
 
 @main.command()

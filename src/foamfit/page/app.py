@@ -126,7 +126,6 @@ class Window:
         return ui.grid(saves, 11.0)
 
     def _report(self) -> str:
-        """Return the report of the fit, or of the selected cycle."""
         return (self.desk.fits[self.report_of.value] / "report.html").read_text(encoding="utf-8")
 
     # ------------------------------------------------------------------------------- beside

@@ -97,7 +97,6 @@ class Worker:
         self.process.join()
 
     def _listen(self) -> None:
-        """Read the reports of the process until it ends."""
         done: str | None = None
         with suppress(EOFError, OSError):
             while done is None:
@@ -227,7 +226,6 @@ def _fitted(job: Job, teller: _Teller) -> tuple[str, str]:
 
 
 def _wait_for_stop(pipe: Connection) -> None:
-    """Interrupt the main thread when a message says so."""
     with suppress(EOFError, OSError):
         if pipe.recv() == STOP:
             _thread.interrupt_main()

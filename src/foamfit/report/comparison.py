@@ -186,17 +186,14 @@ class Side:
 
 def side_of(result: Result) -> Side:
     """Return the parameters of a fit; InputError if the result is incomplete."""
-    given: Mapping[str, Any]
-    if isinstance(result, Fit):
-        given = result.to_json_dict()
-    else:
-        given = result if isinstance(result, Mapping) else load_result(result)
+    known = result.to_json_dict() if isinstance(result, Fit) else result
+    given = known if isinstance(known, Mapping) else load_result(known)
     with reading(str(result) if isinstance(result, str | Path) else "the result"):
         model, about = Model.of_result(given), (given["test"], given["drive"], given["status"])
         every = given["parameters"].items()
         estimates = {n: build(ParameterEstimate, {**p, "state": p["state"]}, {}) for n, p in every}
-        known = given.get("correlation") or {"names": (), "matrix": ()}
-        numbers = _with_errors(estimates, known["names"], known["matrix"])
+        shared = given.get("correlation") or {"names": (), "matrix": ()}
+        numbers = _with_errors(estimates, shared["names"], shared["matrix"])
         label = f"{about[0]}: {law_in_words(model.name, model.relaxation)}, {about[1]} drive"
         return Side(label, model, estimates, numbers, _GIVEN | dict(given))
 

@@ -111,14 +111,11 @@ def results_in(folder: str | Path) -> list[Row]:
     top = Path(folder)
     if not top.is_dir():
         raise InputError(f"{folder} is not a folder; foamfit fit TEST.csv writes results to fits/")
-    found = sorted({path for name in ("fit.json", "joint.json") for path in top.rglob(name)})
-    of_joint = {path.parent for path in found if path.name == "joint.json"}
-    kept = [
-        path for path in found if path.name == "joint.json" or path.parent.parent not in of_joint
-    ]
-    if not kept:
+    joints = {*top.rglob("joint.json")}
+    fits = {one for one in top.rglob("fit.json") if one.parent.parent / "joint.json" not in joints}
+    if not joints | fits:
         raise InputError(f"there is no result in {folder}; foamfit fit TEST.csv writes one")
-    return [_listed(path) for path in kept]
+    return [_listed(path) for path in sorted(joints | fits)]
 
 
 def _listed(path: Path) -> Row:
@@ -354,10 +351,9 @@ def write_comparison(
 
 def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | None = None) -> None:
     """Write summary.html, a self-contained page, with a figure (SVG)."""
-    shown = rows
-    if len(rows) > MOST_ON_PAGE:  # tests without a fit are always shown
-        first = {id(row) for row in rows[:MOST_ON_PAGE]}
-        shown = [row for row in rows if id(row) in first or not row.has_fit][: 2 * MOST_ON_PAGE]
+    # Tests without a fit are always shown.
+    some = [row for i, row in enumerate(rows) if i < MOST_ON_PAGE or not row.has_fit]
+    shown = some[: 2 * MOST_ON_PAGE]
     more: Any = {"picture": picture, "csv": "summary.csv", "left_out": len(shown) < len(rows)}
     text = index_page(shown, folder, title, counts_in_words(rows), **more)
     write_file(folder / "summary.html", text)

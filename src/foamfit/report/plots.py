@@ -216,7 +216,6 @@ def plot_profiles(result: Fit) -> Figure | None:
 
 
 def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> None:
-    """Draw one profile: threshold, interval, and the parabola of the standard error."""
     factor, unit = readable_unit(float(np.max(np.abs(profile.values))), estimate.unit)
     top = 2.0 * profile.cut
     best = float(profile.values[np.argmin(profile.rises)])

@@ -77,15 +77,10 @@ def count_determined(parameters: Parameters) -> tuple[int, int]:
     return sum(p.state == "determined" for p in varied), len(varied)
 
 
-def names_of(each: Iterable[Parameters]) -> list[str]:
-    """Return the names of the parameters of all tests, those of the springs first."""
-    return springs_first(name for one in each for name in one)
-
-
 def varied(each: Sequence[Parameters]) -> dict[str, list[ParameterEstimate | None]]:
     """Return, for each parameter varied in any test, its values in all tests; None if missing."""
     out = dict[str, list[ParameterEstimate | None]]()
-    for name in names_of(each):
+    for name in springs_first(name for one in each for name in one):
         values = (one.get(name) for one in each)
         finite = [p if p is not None and np.isfinite(p.value) else None for p in values]
         if any(p is not None and p.vary for p in finite):
@@ -102,7 +97,7 @@ def with_head(rows: Iterable[Mapping[str, object]]) -> Iterator[Iterable[object]
 
 def wide(each: Sequence[Parameters]) -> Iterator[dict[str, Any]]:
     """Yield the parameters of each test as a row of a table, in SI; None for missing values."""
-    names = names_of(each)
+    names = springs_first(name for one in each for name in one)
     for parameters in each:
         row = dict[str, Any]()
         for name, p in zip(names, map(parameters.get, names), strict=True):

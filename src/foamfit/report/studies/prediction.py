@@ -237,15 +237,10 @@ def _panels(found: Prediction) -> list[Panel]:
         for part, look in COLOURS.items():
             if part in c.parts and np.any(c.parts[part]):
                 halves[part.replace("_", " ")] = (c.parts[part], *look)
-        below = [
-            Line(
-                x,
-                100.0 * half / c.range,
-                f"half width: {part}",
-                {"color": colour, "ls": dashes, "lw": 0.9},
-            )
-            for part, (half, colour, dashes) in halves.items()
-        ]
+        below = list[Line]()
+        for part, (half, colour, dashes) in halves.items():
+            style = {"color": colour, "ls": dashes, "lw": 0.9}
+            below.append(Line(x, 100.0 * half / c.range, f"half width: {part}", style))
         name = c.channel.replace("_", " ")
         panels.append(Panel(f"{name}-time", *timed, name, c.unit, lines, below, "half width"))
     return panels
