@@ -7,7 +7,7 @@ Content of files is always shown as escaped text.
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
@@ -268,30 +268,23 @@ class Window:
         self._allow()
         self.inputs.relaxation.disabled, self.curves.sliders.ticks = auto, not auto
         if self.desk.measurement is None:
-            self._hide_curves()
+            self._show_turning("")
             return
         try:
             asked = parsed(self.inputs.arguments())
         except InputError:  # reported when the fit is started
             asked = parsed([])
         model = ui.models()[1] if auto else self.inputs.model.value
-        self._turn_model(model, self.desk.measurement, **keywords(asked))
-
-    def _hide_curves(self, why: object = "") -> None:
-        self.curves.hide()
-        self.misfit.object = ui.wrong(why)
+        self._turn_model(model, self.desk.measurement, asked, {})
 
     def _turn_model(
-        self,
-        model: str,
-        of: Measurement | News,
-        values: Mapping[str, float] | None = None,
-        **options: Any,
+        self, model: str, of: Measurement | News, asked: dict[str, Any], values: dict[str, float]
     ) -> None:
         """Show the sliders of a model, at `values` or at values read off the measured loop.
 
-        `of` gives the cycles: a test, or the report of a fit.
+        `of` gives the cycles: a test, or the report of a fit. `asked` are the options of the fit.
         """
+        options: Any = {one: asked[one] for one in ui.OF_CURVES}
 
         def make() -> Turning:
             self.first_use.done.result()
@@ -307,12 +300,14 @@ class Window:
             self.curves.sliders.tell(what)
         self._beside(PREPARING, make, self._show_turning)
 
-    def _show_turning(self, made: Turning | Exception) -> None:
-        if isinstance(made, Exception):
-            self._hide_curves(made)
-            return
-        self.misfit.object = ""
-        self.curves.show(made)
+    def _show_turning(self, made: Turning | Exception | str) -> None:
+        """Show curves, or hide them and show why there are none."""
+        if isinstance(made, Turning):
+            self.misfit.object = ""
+            self.curves.show(made)
+        else:
+            self.curves.hide()
+            self.misfit.object = ui.wrong(made)
 
     # ------------------------------------------------------------------------------- the fit
 
@@ -385,9 +380,9 @@ class Window:
     def _turn_fitted(self, news: News) -> None:
         """Show the curves of the last fit at the reported values."""
         assert self.desk.worker is not None
-        options = keywords(parsed(self.desk.worker.job.arguments))
-        options |= {"relaxation": news.relaxation, "drive": news.drive}
-        self._turn_model(news.model, news, news.values, **options)
+        asked = parsed(self.desk.worker.job.arguments)
+        asked |= {"relaxation": news.relaxation, "drive": news.drive}
+        self._turn_model(news.model, news, asked, news.values)
 
     def _ended(self, worker: Worker) -> None:
         """Show the result of the fit, or why it failed."""
@@ -424,11 +419,6 @@ class Window:
         place = {name: fit[name] for name in ("relaxation", "drive")}
         place |= {name: fit["data"][name] for name in ("cycle", "last_cycle")}
         self._turn_fitted(News(values=values, model=Model.of_result(fit).name, **place))
-
-
-def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options that change the curves of a model."""
-    return {one: asked[one] for one in ui.OF_CURVES}
 
 
 def send_at_once() -> None:
