@@ -99,14 +99,9 @@ def declared(name: str, **more: Any) -> Callable[[Command], Command]:
     """Declare an option of `foamfit.options`; `more` are arguments of click that differ."""
     one = OPTIONS[name]
     how: dict[str, Any] = {"help": one.text, "default": one.default, "metavar": one.metavar or None}
-    if one.choices:
-        how["type"] = click.Choice(one.choices)
-    elif one.kind == "bool":
-        how["is_flag"] = True
-    elif one.kind == "int":
-        how["type"] = click.IntRange(one.least, one.most)
-    elif one.kind == "float":
-        how["type"] = float
+    whole = click.IntRange(one.least, one.most)
+    kinds: Any = {"bool": {"is_flag": True}, "int": {"type": whole}, "float": {"type": float}}
+    how |= {"type": click.Choice(one.choices)} if one.choices else kinds.get(one.kind, {})
     return click.option(one.flag, **how | READ.get(name, {}) | more)
 
 

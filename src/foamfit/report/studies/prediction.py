@@ -61,18 +61,18 @@ class PredictedCurve:
         """Range of the measured values."""
         return float(np.ptp(self.measured))
 
-    def met(self, part: slice) -> tuple[float, float]:
+    def met(self, part: slice) -> dict[str, float]:
         """Return misfit over the range, and fraction inside the band, of a part of the samples."""
         kept, measured = self.kept[part], self.measured[part]
         residual = (self.predicted[part] - measured)[kept]
         within = (self.lo[part] <= measured) & (measured <= self.hi[part])
         misfit = np.sqrt(np.mean(residual**2)) / np.ptp(measured[kept])
-        return float(misfit), float(np.mean(within[kept]))
+        return {"misfit": float(misfit), "inside": float(np.mean(within[kept]))}
 
     @property
     def inside(self) -> float:
         """Fraction of the samples inside the band."""
-        return self.met(slice(None))[1]
+        return self.met(slice(None))["inside"]
 
     @property
     def half_width(self) -> float:
@@ -149,8 +149,7 @@ class Prediction(Result, OfLaw):
         The curve is the stress if the motion is prescribed, otherwise the first curve.
         """
         curve = self.curves.get("stress_time", next(iter(self.curves.values())))
-        each = {n: curve.met(part) for n, part in cycles_of(self.measurement).items()}
-        return {n: {"misfit": misfit, "inside": inside} for n, (misfit, inside) in each.items()}
+        return {n: curve.met(part) for n, part in cycles_of(self.measurement).items()}
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``prediction.json``: SI, plain types, None for missing values."""
