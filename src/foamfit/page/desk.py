@@ -357,10 +357,10 @@ def _picture(csv: Path, toml: Path, strained: bool) -> bytes:
     if test.stress is None:
         raise InputError("there is no force to draw")
     motion = ("strain", "–") if strained else ("displacement", "m")
-    for x, name, unit in ((test.time, "time", "s"), (test.displacement, *motion)):
+    for x, axis in ((test.time, ("time", "s")), (test.displacement, motion)):
         if x is not None:
-            style = {"color": figures.BLUE, "lw": 0.9}
-            panels.append(Panel(name, name, unit, "force", "N", [Line(x, test.stress, "", style)]))
+            line = Line(x, test.stress, "", {"color": figures.BLUE, "lw": 0.9})
+            panels.append(Panel(axis[0], axis, ("force", "N"), [line]))
     with figures.drawing(7.0, 2.6) as figure:
         axes = figures.grid_of(figure, 1, max(len(panels), 1), len(panels))
         for ax, panel in zip(axes, panels, strict=True):

@@ -42,16 +42,14 @@ class Line:
 
 @dataclass(frozen=True)
 class Panel:
-    """Curves in common axes, with the names and SI units of the axes.
+    """Curves in common axes, with name and SI unit of x and of y.
 
     `below` are curves in a strip below the panel, in % of the measured range: residuals or others.
     """
 
     name: str  # "stress-strain", …
-    x_name: str
-    x_unit: str
-    y_name: str
-    y_unit: str
+    x: tuple[str, str]
+    y: tuple[str, str]
     lines: list[Line]
     below: list[Line] = field(default_factory=list)
     below_name: str = "residual"
@@ -68,9 +66,9 @@ class Panel:
 
     def scale(self) -> tuple[float, str, float, str]:
         """Return factor and axis label of x, then of y."""
-        x, x_unit = readable_unit(max(size(line.x) for line in self.lines), self.x_unit)
-        y, y_unit = readable_unit(max(size(line.y) for line in self.lines), self.y_unit)
-        return x, f"{self.x_name} ({x_unit})", y, f"{self.y_name} ({y_unit})"
+        fx, x_unit = readable_unit(max(size(line.x) for line in self.lines), self.x[1])
+        fy, y_unit = readable_unit(max(size(line.y) for line in self.lines), self.y[1])
+        return fx, f"{self.x[0]} ({x_unit})", fy, f"{self.y[0]} ({y_unit})"
 
 
 def is_known(result: Fit) -> bool:
@@ -106,10 +104,11 @@ def panels_of(result: Fit) -> list[Panel]:
         loop.append(Line(strain, c.stress_along, "springs along measured strain", pale))
     pushed_off = _residual(c.time, c.measured_stress, compared("stress_time", c.stress))
     looped_off = _residual(strain, c.measured_stress, compared("stress_strain", c.stress_along))
+    time, stress = ("time", "s"), ("stress", "Pa")
     panels = [
-        Panel("stress-time", "time", "s", "stress", "Pa", pushing, pushed_off),
-        Panel("displacement-time", "time", "s", "displacement", "m", moving, off),
-        Panel("stress-strain", "strain", "–", "stress", "Pa", loop, looped_off),
+        Panel("stress-time", time, stress, pushing, pushed_off),
+        Panel("displacement-time", time, ("displacement", "m"), moving, off),
+        Panel("stress-strain", ("strain", "–"), stress, loop, looped_off),
     ]
     if is_known(result):
         panels = [panels[2], panels[0]]

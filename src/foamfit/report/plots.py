@@ -125,9 +125,9 @@ def plot_response(
     pushed = [Line(time, stress, "_base stress", last)]
     looped = [Line(response.strain[loop], stress[loop], "_base stress", last)]
     panels = [
-        Panel("stress-time", "time", "s", "base stress", "Pa", pushed),
-        Panel("displacement-time", "time", "s", "displacement", "m", moving),
-        Panel("stress-strain", "overall strain", "–", "base stress", "Pa", looped),
+        Panel("stress-time", ("time", "s"), ("base stress", "Pa"), pushed),
+        Panel("displacement-time", ("time", "s"), ("displacement", "m"), moving),
+        Panel("stress-strain", ("overall strain", "–"), ("base stress", "Pa"), looped),
     ]
     with panelled(panels, width) as (figure, drawn):
         for ax, panel, _ in drawn[:2]:

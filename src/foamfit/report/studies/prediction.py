@@ -226,7 +226,7 @@ def _panels(found: Prediction) -> list[Panel]:
         for way in (slice(None, turn + 1), slice(turn, None)):
             if stress is not None and moved is None:
                 loop.append(Line(strain[way], stress.lo[way], *BAND, high=stress.hi[way]))
-        panels.append(Panel("stress-strain", "strain", "–", "stress", "Pa", loop))
+        panels.append(Panel("stress-strain", ("strain", "–"), ("stress", "Pa"), loop))
     for c in found.curves.values():
         timed = ("time", "s") if m.time is not None else ("sample", "–")
         x = m.instants
@@ -241,5 +241,5 @@ def _panels(found: Prediction) -> list[Panel]:
             style = {"color": colour, "ls": dashes, "lw": 0.9}
             below.append(Line(x, 100.0 * half / c.range, f"half width: {part}", style))
         name = c.channel.replace("_", " ")
-        panels.append(Panel(f"{name}-time", *timed, name, c.unit, lines, below, "half width"))
+        panels.append(Panel(f"{name}-time", timed, (name, c.unit), lines, below, "half width"))
     return panels
