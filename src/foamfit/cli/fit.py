@@ -263,8 +263,7 @@ def batch(
 
     output.show(lambda: table_rows(rows), lambda: summary_words(rows))
     output.tell_written(folder / "summary.html")
-    wrong = sum(not row.has_fit for row in rows)
-    if not wrong:
+    if not (wrong := sum(not row.has_fit for row in rows)):
         return 0
     have = "has" if wrong == 1 else "have"
     summary = folder / "summary.csv"

@@ -238,8 +238,7 @@ def list_results(folder: Path, opening: bool) -> None:
 
     found = results_in(folder)
     say(lines(found, folder))
-    page = write_index(folder, found)
-    if page is not None:
+    if (page := write_index(folder, found)) is not None:
         say(f"\nthe same with loops and links: {page}")
         if opening:
             options.open_page(page)

@@ -345,8 +345,7 @@ class Window:
 
     def _follow(self) -> None:
         """Show the progress of the fit, and its result when it has ended."""
-        worker = self.desk.worker
-        if worker is None:
+        if (worker := self.desk.worker) is None:
             return
         ended, news = worker.ended, worker.news
         if ended is not None:
@@ -409,8 +408,7 @@ class Window:
 
     def _back(self, event: Any = None) -> None:
         """Show the report of the fit, and move the sliders back to its values."""
-        cycle = self.report_of.value
-        if cycle not in self.desk.fits:
+        if (cycle := self.report_of.value) not in self.desk.fits:
             return
         self.report.object = ui.piece("report", self._report())
         fit = load_result(self.desk.fits[cycle])

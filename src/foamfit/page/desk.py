@@ -118,8 +118,7 @@ class Desk:
         """
         known = csv.suffix.lower() in ENDINGS
         self.receive(csv.name if known else f"{csv.stem}.csv", csv.read_bytes())
-        toml = toml_beside(csv)
-        if toml.is_file():
+        if (toml := toml_beside(csv)).is_file():
             self.dropped = toml.read_bytes()
 
     def dropped_toml(self) -> tuple[dict[str, str], str] | None:

@@ -128,8 +128,7 @@ class Field:
 
     def arguments(self) -> list[str]:
         """Return the arguments for the value filled in; none for the default."""
-        value = self.widget.value
-        if isinstance(value, list):
+        if isinstance(value := self.widget.value, list):
             return [self.flag] if value else []
         text = "" if value is None else str(value).strip()
         return [] if text in ("", str(self.default)) else [self.flag, text]

@@ -100,8 +100,7 @@ class Worker:
         done: str | None = None
         with suppress(EOFError, OSError):
             while done is None:
-                report = self._pipe.recv()
-                if isinstance(report, News):
+                if isinstance(report := self._pipe.recv(), News):
                     self.news = report
                 else:
                     done, self.told = report

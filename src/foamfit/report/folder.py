@@ -119,10 +119,8 @@ def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool
     return folder
 
 
-def save_somewhere(
-    save: Callable[..., object], folder: Path, *, report: bool = True, **options: Any
-) -> None:
-    """Call `save` with a folder, `report` and further options.
+def save_somewhere(save: Callable[..., object], folder: Path, *, report: bool) -> None:
+    """Call `save` with a folder and `report`.
 
     If `folder` cannot be written, save the result next to it, in the current directory or among
     temporary files. If the report fails, which is a defect, save the numbers without it.
@@ -133,18 +131,18 @@ def save_somewhere(
         If `folder` cannot be written; the message names the folder used instead.
     """
     try:
-        save(folder, report=report, **options)
+        save(folder, report=report)
         return
     except InputError as error:
         message = str(error)
     except Exception:
         with suppress(Exception):
-            save(folder, report=False, **options)
+            save(folder, report=False)
         raise
     for place in (folder.parent, Path(), Path(tempfile.gettempdir())):
         other = place / f"{folder.resolve().name}-{time.strftime('%Y%m%d-%H%M%S')}"
         with suppress(InputError):
-            save(other, report=report, **options)
+            save(other, report=report)
             message = f"{message.removesuffix('; choose another folder')}; it is in {other} instead"
             break
     raise InputError(message)
@@ -218,10 +216,9 @@ def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
             "not replaced; choose a new or an empty folder"
         )
     own = _OF_FITS if of in _OF_FITS else (of,)
-    other = [] if of is None else [name for name in kinds if name not in own]
-    if other:
+    if of is not None and (other := [name for name in kinds if name not in own]):
         raise InputError(
-            f"{folder} holds {other[0]}, which does not belong to a {Path(str(of)).stem}, so it is "
+            f"{folder} holds {other[0]}, which does not belong to a {Path(of).stem}, so it is "
             "not replaced; choose a new or an empty folder"
         )
     tests = _content(place / "joint.json").get("tests")  # folders of a joint fit

@@ -108,8 +108,7 @@ def results_in(folder: str | Path) -> list[Row]:
 
     Raises InputError if the folder contains no result.
     """
-    top = Path(folder)
-    if not top.is_dir():
+    if not (top := Path(folder)).is_dir():
         raise InputError(f"{folder} is not a folder; foamfit fit TEST.csv writes results to fits/")
     joints = {*top.rglob("joint.json")}
     fits = {one for one in top.rglob("fit.json") if one.parent.parent / "joint.json" not in joints}

@@ -154,8 +154,7 @@ def frame(parameters: Mapping[str, Any], **more: Mapping[str, Any]) -> pd.DataFr
         row |= {key: values.get(name) for key, values in more.items()}
         known = {key: np.nan if one is None else one for key, one in row.items()}
         rows.append(known | {"unit": getattr(p, "unit", ""), "state": p.state})
-    made: pd.DataFrame = _frame_type()(rows, columns=None if rows else ["parameter"])
-    return made.set_index("parameter")
+    return _frame_type()(rows, columns=None if rows else ["parameter"]).set_index("parameter")
 
 
 def numbers_of(p: Any) -> dict[str, float | None]:
@@ -170,12 +169,11 @@ def stacked(frames: Mapping[Any, pd.DataFrame], name: str) -> pd.DataFrame:
     import pandas as pd
 
     filled = {key: one for key, one in frames.items() if len(one)}
-    made: pd.DataFrame = _frame_type()(pd.concat(filled, names=[name]))
-    return made
+    return _frame_type()(pd.concat(filled, names=[name]))
 
 
 @functools.cache
-def _frame_type() -> Any:
+def _frame_type() -> type[pd.DataFrame]:
     import pandas as pd
 
     class Table(pd.DataFrame):
