@@ -348,10 +348,9 @@ def check(format: str, units: str, rates: float | Iterable[float | str] | None) 
     if rates is None:
         return []
     given = [rates] if isinstance(rates, str | int | float) else list(rates)
-    try:
+    found = list[float]()
+    with suppress(TypeError, ValueError):
         found = sorted({float(rate) for rate in given})
-    except (TypeError, ValueError):
-        found = []
     if not found or not all(0.0 < rate < math.inf for rate in found):
         raise InputError(
             f"rates = {','.join(map(str, given))} must be positive numbers in 1/s, like 0.01,1,100"

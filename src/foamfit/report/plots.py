@@ -188,12 +188,9 @@ def panelled(
 
 def figures_of(result: Fit, width: str = TWO) -> dict[str, Figure]:
     """Return the figures of a result by name; `width` is that of "fit"."""
-    drawn = {
-        "fit": plot_fit(result, width=width),
-        "snapping": plot_snapping(result),
-        "profiles": plot_profiles(result),
-    }
-    return {name: figure for name, figure in drawn.items() if figure is not None}
+    others = {"snapping": plot_snapping(result), "profiles": plot_profiles(result)}
+    drawn = {name: figure for name, figure in others.items() if figure is not None}
+    return {"fit": plot_fit(result, width=width), **drawn}
 
 
 def plot_profiles(result: Fit) -> Figure | None:
