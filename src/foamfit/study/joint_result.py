@@ -17,12 +17,11 @@ from foamfit.fitting.links import RATES
 from foamfit.parts import OfLaw, ParameterEstimate
 from foamfit.report import figures
 from foamfit.report.figures import TWO
-from foamfit.report.folder import write_json, write_result, write_text
+from foamfit.report.folder import Result, brief, write_json, write_result, write_text
 from foamfit.report.listing import Row, table_of
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import readable, readable_unit
 from foamfit.report.render import page, words
-from foamfit.report.shown import Result, brief
 from foamfit.report.studies.parameters import Panel, plot_parameters
 from foamfit.report.tables import MISFITS, formula, frame, parameters_tex, stacked, symbols
 from foamfit.results import Fit, Loop, stamp

@@ -29,7 +29,7 @@ from foamfit.fitting.scenes import channel_of
 from foamfit.fitting.search import Tracker, descend
 from foamfit.parts import ParameterEstimate
 from foamfit.report import render
-from foamfit.report.shown import Result
+from foamfit.report.folder import Result
 from foamfit.report.studies.prediction import COLOURS, PredictedCurve, Prediction
 from foamfit.springs.parameters import unit_of
 from foamfit.study.identified import NORMAL, Source, read_source
