@@ -53,6 +53,7 @@ from foamfit.trust.settle import (
     keep_to_record,
     refine,
     weigh_motion,
+    weigh_priors,
 )
 
 CARRIED = 8  # minima of a poorer model from which the search of a richer one begins
@@ -384,6 +385,7 @@ def _search(
         descend_again(problem, tracker)
         problem, freed = keep_to_record(problem, tracker, asked, search_held)
         record = replace(record, freed=freed)
+        problem = weigh_priors(problem, tracker)
         weigh_motion(problem, tracker)
         settle_ends(tracker, problem.space())
     except STOPPING as error:

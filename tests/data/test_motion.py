@@ -150,6 +150,15 @@ def test_noise_about_a_flat_peak_does_not_move_it():
     assert np.std(rates) < 8.0
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_rest_before_the_ramp_is_no_loading(seed):
+    """Counted from the first row the rate was up to 5 % too low."""
+    time, rng = np.linspace(0.0, 62.0, 901), np.random.default_rng(seed)
+    strain = np.interp(time, [0.0, 2.0, 32.0, 62.0], [0.0, 0.0, 0.6, 0.0])
+    rate = loading_rate(moved(time, strain + 2e-3 * rng.standard_normal(time.size)))
+    assert rate == pytest.approx(0.02, rel=0.006)
+
+
 @pytest.mark.parametrize("end", [3.0, 4.0, 20.0])
 def test_a_hold_at_the_largest_strain_is_no_loading(end):
     time = np.linspace(0.0, 30.0, 3001)

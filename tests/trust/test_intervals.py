@@ -57,6 +57,7 @@ class Curve:
     penalty: float = 1e3
     drive: str = "displacement"
     priors: tuple[()] = ()
+    unit: float = 1.0
 
     def __post_init__(self) -> None:
         self.sizes = (self.time.size,)

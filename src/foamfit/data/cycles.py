@@ -408,4 +408,7 @@ def _velocity(time: Array, motion: Array, sigma: float) -> float | None:
     close, first = time[near], time[np.argmax(motion >= most - depth)]
     share = math.sqrt(depth / ((1.0 - _CLOSE) * most))  # of the way from `close` that is left
     top = float(close + (first - close) / (1.0 - share)) if share < 1.0 else when
-    return most / (top if when > _HELD * top else when)
+    top = top if when > _HELD * top else when
+    rest = np.flatnonzero(motion[:near] <= depth)  # rows of a rest before contact do not load
+    low = int(rest[-1]) + 1 if depth > 0.0 and rest.size else 0
+    return float((most - motion[low]) / (top - time[low]))

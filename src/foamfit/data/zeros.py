@@ -157,6 +157,8 @@ def take_zeros(
             if abs(zero.value) > (0.0 if top else 1e-3 * np.ptp(values)):
                 label, size = "The displacement" if top else name, engineering(zero.value, "m")
                 note = f"{label} at contact, {size}, is taken off ({source})."
+        if not impact and start.by == "file" and not zero.samples and values[0] == 0.0:
+            errors[name] = noise.sigma  # set to zero at its first row, whose noise it contains
         record = record.shifted(name, zero.value).noted(*[note] * bool(note))
     return replace(record, zeros=errors)
 

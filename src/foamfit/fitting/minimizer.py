@@ -43,14 +43,15 @@ def problem_of(fit: Fit) -> Problem:
         made = replace(made, objective=replace(made.objective, followed=(None,)))
     if fit.weighed_at:
         made.objective.weigh_motion(np.array(fit.weighed_at))
-    residual = made.objective.residual(made.vector())
     was = float(fit.statistics["chisqr"] or 0.0)
-    if not math.isclose(float(residual @ residual), was, rel_tol=SAME, abs_tol=1e-9):
-        raise InputError(
-            f"{fit.measurement.name}: the folder does not say how the samples of this fit were "
-            "weighted; fit the test again to use it with lmfit"
-        )
-    return made
+    for objective in (made.objective, replace(made.objective, erring=True)):
+        residual = objective.residual(made.vector())
+        if math.isclose(float(residual @ residual), was, rel_tol=SAME, abs_tol=1e-9):
+            return replace(made, objective=objective)
+    raise InputError(
+        f"{fit.measurement.name}: the folder does not say how the samples of this fit were "
+        "weighted; fit the test again to use it with lmfit"
+    )
 
 
 def minimizer_of(fit: Fit) -> lmfit.Minimizer:

@@ -79,12 +79,12 @@ def priors_of(measurement: Measurement, drive: str) -> dict[str, Prior]:
     """Return the priors of nuisance parameters: zeros measured before contact, ± of the TOML.
 
     A machine may move before it touches the specimen, so its rest position is not the zero of a
-    driving motion. The mass has no prior if the stress was computed from it, because force and
-    inertia then change together.
+    driving motion, unless it is set to zero at the first row, in contact. The mass has no prior if
+    the stress was computed from it, because force and inertia then change together.
     """
     values = values_of(measurement)
     known = {zero: measurement.zeros.get(channel) for zero, channel in ZEROS.items()}
-    if drive != "impact":
+    if drive != "impact" and measurement.contact != "file":
         known["displacement_zero"] = None
     stated = {VELOCITY: "velocity", STRIKER_MASS: "striker_mass", TIME_SHIFT: "delay"}
     stated[FORCE_SCALE] = "stress_scale"
@@ -108,7 +108,7 @@ def open_in(measurement: Measurement, drive: str, counted: Mapping[str, bool]) -
         known.add(CONTACT_TIME)
     else:
         elsewhere = measurement.origins.get("displacement_zero", 0.0) != 0.0
-        moved = elsewhere or measurement.contact != "file"
+        moved = elsewhere or measurement.contact != "file" or "displacement" in measurement.zeros
     return frozenset(known | {"displacement_zero"} if moved else known)
 
 

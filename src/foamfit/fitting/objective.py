@@ -112,6 +112,7 @@ class Objective:
     nuisance: tuple[str, ...] = OF_DRIVE
     weighing: Weighing | None = None  # Effect of an uncertain driving motion; see `weigh_motion`
     given: tuple[nuisances.Prior, ...] = ()  # Priors of spring parameters
+    erring: bool = False  # Whether priors count as if the scale of the curves were their noise
     followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is already known
     averaged: float = np.inf  # longest time that a sample averages, s, if the samples are thinned
     glued: bool | None = None  # see `is_glued`; None: as the record shows
@@ -174,7 +175,7 @@ class Objective:
         names = (*self.model.names, *self.nuisance)
         self._prior_places = np.array([names.index(one.name) for one in self.priors], np.int64)
         self._means = np.array([one.mean for one in self.priors])
-        self._sigmas = np.array([one.sigma for one in self.priors])
+        self._sigmas = np.array([one.sigma for one in self.priors]) / self.unit
 
     def _open_zero(self, name: str) -> float:
         """Return the share of its mean that is taken off the residual of an interior motion.
@@ -399,6 +400,14 @@ class Objective:
         """The noise floor: 1.5 times the sum of squares expected from noise alone."""
         sizes = zip(self.counted, self.sizes, strict=True)
         return 1.5 * sum(n * (self.noise(one).sigma * self.factor(one)) ** 2 for one, n in sizes)
+
+    @property
+    def unit(self) -> float:
+        """Residual of a prior at one standard deviation: the RMS expected from noise alone.
+
+        One if the law errs, as its error is of the size of the scales.
+        """
+        return 1.0 if self.erring else math.sqrt(self.floor / 1.5 / self.n_data) or 1.0
 
     def factor(self, name: str) -> float:
         """Return the residual of a deviation of one SI unit in a curve."""

@@ -163,7 +163,7 @@ def look(
     weigh, noise = np.ones((2, objective.n_data + len(objective.priors)))
     weigh[: objective.n_data] = math.sqrt(each)
     own = [objective.noise(c).sigma * objective.factor(c) for c in counted]
-    noise[: objective.n_data] = np.repeat(own, objective.sizes)
+    noise[:] = np.append(np.repeat(own, objective.sizes), [objective.unit] * len(objective.priors))
     k, d = len(known.names), len(known.draws)
     bread, meat = np.zeros((2, d, k, k))
     reached, broken = np.zeros((d, k), dtype=bool), np.ones(d, dtype=bool)

@@ -154,6 +154,7 @@ class BestPoint:
             gradient=self.gradient if any(error.found for error in errors) else None,
             room=(np.abs(self.box - self.values[self.places]) / self.sizes).T,
             shifts=self.shifts if self.problem.kept else None,
+            of_priors=self.problem.objective.unit**2,
         )  # fmt: skip
 
     @cached_property

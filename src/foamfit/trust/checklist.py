@@ -265,7 +265,7 @@ def _of_priors(best: BestPoint, estimates: Estimates, with_error: Sequence[str])
         end = min(ends, key=attrgetter("cost"))
         values = space.decode(end.point)
         slopes = problem.slopes(values, names)[others]
-        found = covariance(slopes, end.residual, objective.sizes, sizes)
+        found = covariance(slopes, end.residual, objective.sizes, sizes, objective.unit**2)
         error, alone = float(found.stderr[names.index(prior.name)]), values[best.index[prior.name]]
         if end.cost > objective.floor:  # the law errs
             low, high = estimates[prior.name].range or (0.0, 0.0)

@@ -98,6 +98,7 @@ class Block:
     # (n, q): change of the residual by one standard error of each quantity that the fit takes as
     # exact, like a parameter held where the record shows it
     shifts: Array | None = None
+    of_priors: float = 1.0  # variance of the residuals of priors
 
     @cached_property
     def axes(self) -> tuple[Array, Array]:
@@ -116,7 +117,7 @@ class Block:
         """Covariance of the noise along the orthonormal columns, (r, r)."""
         rest = self.axes[0][sum(self.sizes) :]
         inner = sum(left.T @ one.times(left) for one, left in self.curves)
-        return np.asarray(inner + rest.T @ rest)
+        return np.asarray(inner + self.of_priors * (rest.T @ rest))
 
     def without(self, held: NDArray[np.bool_]) -> Block:
         """Return the block with some of the unknowns fixed."""
@@ -290,16 +291,17 @@ class Uncertainty:
 
 
 def covariance(
-    jacobian: Array, residual: Array, sizes: tuple[int, ...], scales: Array
+    jacobian: Array, residual: Array, sizes: tuple[int, ...], scales: Array, of_priors: float = 1.0
 ) -> Covariance:
     """Return the covariance of a least-squares fit of one test, with noise from its residual.
 
     `residual` (n,) and `jacobian` (n, k) are taken at the best point; they contain `sizes` samples
-    of each curve in turn, then priors of unit variance. `scales` (k,) are those of the parameters.
+    of each curve in turn, then those of priors, of variance `of_priors`. `scales` (k,) are those of
+    the parameters.
     """
     scaled = jacobian * scales
     noise = noise_processes(residual, scaled, sizes)
-    block = Block(scaled, residual, sizes, noise, np.eye(scales.size))
+    block = Block(scaled, residual, sizes, noise, np.eye(scales.size), of_priors=of_priors)
     return Uncertainty((block,), scales).covariance
 
 

@@ -194,7 +194,7 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
     if best.misfits:
         apart, objective = residual - best.residual, best.problem.objective
         pairs = zip(best.spread.noise, objective.by_curve(apart).values(), strict=True)
-        spread = float(np.sum(apart[objective.n_data :] ** 2))  # of priors, of unit variance
+        spread = objective.unit**2 * float(np.sum(apart[objective.n_data :] ** 2))  # of priors
         spread += sum(float(own @ process.times(own)) for process, own in pairs)
         near = float(residual @ residual) - best.cost <= 1.96 * 2.0 * math.sqrt(spread)
         return best.halves if near else np.full(best.halves.shape, np.nan)
@@ -311,7 +311,7 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     low, high = best.box
     variances = [process.variance * process.tau for process in best.spread.noise]
     weights = np.repeat(1.0 / np.array(variances), objective.sizes)
-    weights = np.append(weights, np.ones(len(objective.priors)))
+    weights = np.append(weights, np.full(len(objective.priors), objective.unit**-2))
 
     def log_probability(scaled: Array) -> float:
         point = best.values.copy()

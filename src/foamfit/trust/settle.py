@@ -117,6 +117,18 @@ def keep_to_record(
     )
 
 
+def weigh_priors(problem: Problem, tracker: Tracker) -> Problem:
+    """Return the problem with priors that count for more if the law errs, after a descent."""
+    objective, values = problem.objective, tracker.best_values
+    if values is None or not objective.priors or objective.unit >= 1.0:
+        return problem
+    if errs(BestPoint(problem, values)):
+        tracker.objective = replace(objective, erring=True)
+        problem = replace(problem, objective=tracker.objective)
+        descend_again(problem, tracker)
+    return problem
+
+
 def _misfit(problem: Problem, values: Array) -> float:
     """Return the largest misfit of the counted curves, RMS over range."""
     objective = problem.objective
