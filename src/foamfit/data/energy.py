@@ -137,20 +137,14 @@ def audit(test: Measurement) -> EnergyAudit:
     elif change is None:
         missing.append("The balance of momentum needs an impact of known mass with its rebound.")
     return EnergyAudit(
-        striker_energy=brought,
-        absorbed_energy=absorbed,
-        dissipated_energy=dissipated,
+        striker_energy=brought, absorbed_energy=absorbed, dissipated_energy=dissipated,
         dissipated_fraction=dissipated / absorbed if dissipated is not None and absorbed else None,
         absorbed_over_striker=absorbed / brought if absorbed is not None and brought else None,
-        rebound_velocity=rebound,
-        impulse=impulse,
-        momentum_change=change,
+        rebound_velocity=rebound, impulse=impulse, momentum_change=change,
         impulse_ratio=impulse / change if impulse is not None and change else None,
-        motion=test.motion,
-        missing=tuple(missing),
-        contradictions=contradictions(test, shown),
+        motion=test.motion, missing=tuple(missing), contradictions=contradictions(test, shown),
         damping=None if shown.damping is None else shown.damping[0],
-    )
+    )  # fmt: skip
 
 
 def _momentum(test: Measurement, unloaded: bool) -> tuple[float | None, float | None, float | None]:

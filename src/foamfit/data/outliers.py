@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from foamfit.arrays import Array, Integers, Mask
 from foamfit.data.measurement import MIN_ROWS, UNITS, NoiseLevel, Outliers, Record
@@ -261,7 +262,7 @@ def notes_on(record: Record, spikes: dict[str, int], found: dict[str, Outliers])
     return notes + [note for note, rows in record.standstills.items() if rows.any()]
 
 
-def fresh_samples(values: Array | Mask) -> tuple[Integers, Integers]:
+def fresh_samples(values: NDArray[Any]) -> tuple[Integers, Integers]:
     """Return the samples with a new value, and the number of samples that each is held."""
     fresh = np.append(0, np.flatnonzero(np.diff(values) != 0) + 1)
     return fresh, np.diff(np.append(fresh, len(values)))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array, means
-from foamfit.data import blocks, contact, cycles, frames, zeros
+from foamfit.data import blocks, contact, cycles, zeros
 from foamfit.data import outliers as repair
 from foamfit.data.calibration import with_gravity
 from foamfit.data.measurement import (
@@ -117,23 +117,15 @@ def condition(
     whole, block = blocks.without_holds(whole, impact=impact)
     record = blocks.thin(whole, block)
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
-    noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
+    noise |= {c: blocks.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
     noise |= _of_velocity(whole, impact=impact)
     test = _measured(
-        whole,
-        record,
-        block,
-        excess,
-        specimen=specimen,
-        striker=striker and given,
+        whole, record, block, excess, specimen=specimen, striker=striker and given, flight=flight,
         noise=replace(_stated_of_blocks(stated or Noise(), levels, whole, block), estimated=noise),
-        contact="stress" if used.place else start.by,
-        cycle=used.number,
+        contact="stress" if used.place else start.by, cycle=used.number, last_cycle=used.last,
         cycles=tuple(cycle.number for cycle in found) or (1,),
-        last_cycle=used.last,
         rise=rise and _on_clock(rise, whole, block, 0 if used.place else span.first),
-        flight=flight,
-    )
+    )  # fmt: skip
     return with_gravity(test) if impact else test
 
 
@@ -162,14 +154,11 @@ def _of_velocity(record: Record, *, impact: bool) -> dict[str, NoiseLevel]:
 
 def _stated_of_blocks(stated: Noise, levels: contact.Levels, record: Record, block: int) -> Noise:
     """Return the stated noise of samples for means of blocks; `levels` give its correlation."""
-
-    def of(name: str) -> float | None:
-        if (level := stated.levels.get(name)) is None:
-            return None
+    sigmas = dict[str, float]()
+    for name, level in stated.levels.items():
         level = replace(level, time=levels[name].time if name in levels else 1.0)
-        return frames.noise_of_blocks(level, block, record.sampled.get(name)).sigma
-
-    return Noise(of("stress"), of("displacement"))
+        sigmas[name] = blocks.noise_of_blocks(level, block, record.sampled.get(name)).sigma
+    return Noise(sigmas.get("stress"), sigmas.get("displacement"))
 
 
 def _contact_of_impact(
@@ -197,29 +186,16 @@ def _measured(
     spikes = {name: int(np.count_nonzero(values)) for name, values in excess.items()}
     origins = dict(whole.origins)
     return Measurement(
-        name="",  # name, file and digest follow later
-        path=None,
-        data_sha256="",
-        time=thinned.time,
-        stress=thinned.stress,
-        displacement=thinned.displacement,
-        acceleration=thinned.acceleration,
-        motion=whole.motion,
+        name="", path=None, data_sha256="",  # these follow later
+        time=thinned.time, stress=thinned.stress, displacement=thinned.displacement,
+        acceleration=thinned.acceleration, interior=thinned.interior, sampled=thinned.sampled,
         notes=(*thinned.notes, *repair.notes_on(whole, spikes, outliers)),
-        interior=thinned.interior,
-        outliers=outliers,
-        count=count_rows(whole, outliers, block),
-        start_strain=origins.pop("start_strain", 0.0),
-        before=whole.before,
-        sampled=thinned.sampled,
-        zeros=whole.zeros,
-        origins=origins,
-        derived=whole.derived,
-        braked=whole.braked,
-        block=block,
+        outliers=outliers, count=count_rows(whole, outliers, block), block=block,
+        start_strain=origins.pop("start_strain", 0.0), origins=origins, zeros=whole.zeros,
+        motion=whole.motion, before=whole.before, derived=whole.derived, braked=whole.braked,
         standstills=tuple((float(at[0]), float(at[-1])) for at in stood),
         **known,
-    )
+    )  # fmt: skip
 
 
 def first_rise(record: Record, start: contact.Start, levels: contact.Levels) -> contact.Kink | None:

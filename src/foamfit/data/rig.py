@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import accumulate, pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -150,13 +150,12 @@ class Candidate:
         assert self.strain is not None
         assert self.rate is not None
         ramp = self.strain / self.rate
-        corners, levels = [0.0], [0.0]
-        for _ in range(self.cycles):
-            corners += [corners[-1] + ramp, *([corners[-1] + ramp + self.hold] * bool(self.hold))]
-            corners += [corners[-1] + ramp]
-            levels += [self.strain, *([self.strain] * bool(self.hold)), 0.0]
+        held = bool(self.hold)
+        lasts = [ramp, *[self.hold] * held, ramp] * self.cycles
+        corners = [0.0, *accumulate(lasts)]
+        levels = [0.0, *([self.strain, *[self.strain] * held, 0.0] * self.cycles)]
         parts = [
-            np.linspace(a, b, CYCLE_SAMPLES // 2, endpoint=False) for a, b in pairwise(corners)
+            np.linspace(*ends, CYCLE_SAMPLES // 2, endpoint=False) for ends in pairwise(corners)
         ]
         time = np.append(np.concatenate(parts), corners[-1])
         return time, height * np.interp(time, corners, levels)
@@ -256,8 +255,7 @@ def candidates(rig: Rig, test: Measurement, springs: int) -> list[Candidate]:
             out.append(Candidate("displacement", strain=strain, rate=rate, cycles=cycles))
         for strain, rate in product(grid[0], grid[1] if rig.hold else ()):
             out.append(Candidate("displacement", strain=strain, rate=rate, hold=rig.hold))
-    again = _again(test, rig)
-    return [*out, *([] if again is None else [again])]
+    return [*out, *filter(None, [_again(test, rig)])]
 
 
 def _spread(ends: Range, count: int) -> list[float]:
@@ -302,53 +300,42 @@ def _completed(stated: dict[str, dict[str, Any]], test: Measurement, relaxing: b
             notes.append(said)
 
     striker, rate = test.striker or Striker(), loading_rate(test)
-    if striker.mass and "masses" not in hits:
+    if striker.mass:
         assume(hits, "masses", (striker.mass,), "the mass of the striker")
     if striker.velocity and "masses" in hits:
         low, high = (factor * striker.velocity for factor in FASTER)
-        said = f"velocities from {low:.3g} to {high:.3g} m/s"
-        assume(hits, "velocity", (low, high), said)
+        assume(hits, "velocity", (low, high), f"velocities from {low:.3g} to {high:.3g} m/s")
     if "masses" in hits and "velocity" not in hits:
         raise InputError('[striker] velocity is missing; give it like "0.5 to 6 m/s".')
     slow = "masses" not in hits and rate is not None and test.displacement is not None
     if machine or slow:
-        w, most = test.displacement, 0.5
-        most = most if w is None else float(w.max()) / test.specimen.height
+        w = test.displacement
+        most = 0.5 if w is None else float(w.max()) / test.specimen.height
         low, high = FARTHER[0] * most, min(FARTHER[1] * most, 0.9)
         assume(machine, "strain", (low, high), f"strains from {low:.2g} to {high:.2g}")
         near = rate if rate is not None and "masses" not in hits else 0.1
         low, high = (factor * near for factor in RATE_RANGE)
-        said = f"strain rates from {low:.3g} to {high:.3g} 1/s"
-        assume(machine, "rate", (low, high), said)
+        assume(machine, "rate", (low, high), f"strain rates from {low:.3g} to {high:.3g} 1/s")
     if relaxing and slow and test.time is not None:
         lasts = LONG_HOLD * float(test.time[-1] - test.time[0])
         assume(machine, "hold", lasts, f"a hold of {engineering(lasts, 's')}")
     if "masses" in hits and test.time is not None:
         rate = 1.0 / float(np.median(np.diff(test.time)))
         assume(record, "rate", rate, f"{engineering(rate, 'Hz')} sampling")
-    noise = record.get("noise", {})
-    usual = {"displacement": 1e-3 * test.specimen.height}
-    if test.stress is not None:
-        usual["stress"] = 0.01 * float(np.ptp(test.stress))
+    noise, small = record.get("noise", {}), 1e-3 * test.specimen.height
+    usual = {"stress": small if test.stress is None else 0.01 * float(np.ptp(test.stress))}
     for channel, unit in (("stress", "Pa"), ("displacement", "m")):
         level = test.noise.of(channel)
-        sigma = level.sigma if level and level.sigma else usual.get(channel, usual["displacement"])
+        sigma = level.sigma if level and level.sigma else usual.get(channel, small)
         assume(noise, channel, sigma, f"noise of {engineering(sigma, unit)} ({channel})")
     return Rig(
-        velocity=hits.get("velocity", (0.0, 0.0)),
-        masses=hits.get("masses", ()),
-        strain=machine.get("strain", (0.0, 0.0)),
-        rates=machine.get("rate", (0.0, 0.0)),
-        cycles=machine.get("cycles", max(len(test.cycles), 1)),
-        hold=machine.get("hold", 0.0),
-        force=limits.get("force", math.inf),
-        displacement=limits.get("displacement", math.inf),
-        largest_strain=limits.get("strain", LOCK_UP),
-        sampling=record.get("rate"),
-        noise=noise,
-        interior=record.get("interior", bool(test.interior)),
-        notes=tuple(notes),
-    )
+        velocity=hits.get("velocity", (0.0, 0.0)), masses=hits.get("masses", ()),
+        strain=machine.get("strain", (0.0, 0.0)), rates=machine.get("rate", (0.0, 0.0)),
+        cycles=machine.get("cycles", max(len(test.cycles), 1)), hold=machine.get("hold", 0.0),
+        force=limits.get("force", math.inf), displacement=limits.get("displacement", math.inf),
+        largest_strain=limits.get("strain", LOCK_UP), sampling=record.get("rate"), noise=noise,
+        interior=record.get("interior", bool(test.interior)), notes=tuple(notes),
+    )  # fmt: skip
 
 
 def beyond(rig: Rig, springs: int) -> Iterator[tuple[str, Rig]]:
