@@ -11,7 +11,7 @@ assumed where it alone makes all numbers agree.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,7 +95,15 @@ def contradictions(test: Measurement, shown: Balance | None = None) -> tuple[Con
     `shown` is its `balance`, if that is known.
     """
     shown = balance(test) if shown is None else shown
-    return (*_of_striker(test, shown), *_of_delay(test, shown.delay))
+    found = _of_striker(test, shown)
+    if shown.delay is not None and test.time is not None:
+        (late, error), stated = shown.delay, test.uncertainties.get("delay", 0.0)
+        limit = max(LATE * error, float(np.median(np.diff(test.time))))
+        if abs(late) > max(limit, LATE * math.hypot(error, stated)):
+            says = f"the motion is {'late' if late > 0.0 else 'early'} against the force by "
+            says += f"{engineering(abs(late), 's')} ± {engineering(float(f'{error:.2g}'), 's')}"
+            found.append(Contradiction("time_shift", late, limit, says, ()))
+    return tuple(found)
 
 
 def _of_striker(test: Measurement, shown: Balance) -> list[Contradiction]:
@@ -118,7 +126,11 @@ def _of_striker(test: Measurement, shown: Balance) -> list[Contradiction]:
             found.append(_of_force(test, ratio, limit, striker.mass))
     # If the motion is too fast and too long by one factor, its scale alone may be wrong.
     if len(found) == 2 and abs(found[0].ratio / found[1].ratio - 1.0) < found[1].limit:
-        found = [_of_motion(test, found[1].ratio, found[1].limit)]
+        ratio, limit = found[1].ratio, found[1].limit
+        says = f"the motion is {ratio:.2f} times as large as mass, velocity and force imply"
+        entry = test.entries.get("displacement", Entry("displacement"))
+        lines = ((entry.table, entry.times(1.0 / ratio, TENTH * limit)),)
+        return [Contradiction("motion_scale", 1.0 / ratio, limit, says, lines)]
     return found
 
 
@@ -143,27 +155,6 @@ def _of_force(test: Measurement, ratio: float, limit: float, mass: float) -> Con
         if test.uncertainties.keys() & {"stress_scale", "striker_mass"} == {"stress_scale"}:
             lines.reverse()  # the mass is the number without a ±
     return Contradiction("force_scale", ratio, limit, says, tuple(lines))
-
-
-def _of_motion(test: Measurement, ratio: float, limit: float) -> Contradiction:
-    """Return the contradiction between the scale of the motion and all else."""
-    says = f"the motion is {ratio:.2f} times as large as mass, velocity and force imply"
-    entry = test.entries.get("displacement", Entry("displacement"))
-    line = entry.table, entry.times(1.0 / ratio, TENTH * limit)
-    return Contradiction("motion_scale", 1.0 / ratio, limit, says, (line,))
-
-
-def _of_delay(test: Measurement, delay: Shown | None) -> Iterator[Contradiction]:
-    """Yield the contradiction between the clocks of force and motion, if they disagree."""
-    if delay is None or test.time is None:
-        return
-    late, stated = delay[0], test.uncertainties.get("delay", 0.0)
-    limit = max(LATE * delay[1], float(np.median(np.diff(test.time))))
-    if abs(late) > max(limit, LATE * math.hypot(delay[1], stated)):
-        says = f"the motion is {'late' if late > 0.0 else 'early'} against the force by "
-        error = float(f"{delay[1]:.2g}")
-        says += f"{engineering(abs(late), 's')} ± {engineering(error, 's')}"
-        yield Contradiction("time_shift", late, limit, says, ())
 
 
 def balance(test: Measurement) -> Balance:

@@ -128,8 +128,7 @@ def _choose(cycles: list[Cycle], number: int | None) -> Cycle | None:
 
 def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
     """Keep the samples of one loading and unloading, or of several cycles."""
-    w, n, number = record.displacement, len(cycles), cycle.number
-    assert w is not None  # it has cycles
+    w, n, number = record.curves()["displacement"], len(cycles), cycle.number
     size, start, top, end = float(np.ptp(w)), cycle.first, cycle.top, cycle.end
     notes = []
     if n > 1 or end - start < len(record):
@@ -152,7 +151,7 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
     last = cycle.turn
     if end == len(record) and w[last] - w[last:].min() <= _UNLOADED * size:
         notes.append("The record has no unloading, so the unloading is undetermined.")
-    after = f"after cycle {number if cycle.last is None else cycle.last}"
+    after = f"after cycle {cycle.last or number}"
     return record.noted(*notes).between(start, end, f"before cycle {number}", after)
 
 
@@ -167,9 +166,8 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     strain not recovered is `origins["start_strain"]`. The motion `before` is kept, as a stress that
     relaxes remembers it.
     """
-    w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
-    turn, end_of = cycle.turn, number if cycle.last is None else cycle.last
-    assert w is not None  # it has cycles
+    w, stress, top = record.curves()["displacement"], record.stress, cycle.top
+    turn, number, end_of = cycle.turn, cycle.number, cycle.last or cycle.number
     free, error = _level_between(record, cycles, cycle.place - 1)
     mean = smooth(stress, max(1, (top - cycle.first) // 100))
     glued = _is_glued(record, free, float(mean[top]))
@@ -203,10 +201,8 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     if offset < 0.0:
         notes.append(_offset_note("between the cycles", offset))
     elif loaded > _STILL_LOADED:
-        notes.append(
-            "Check: the specimen stays under load between the cycles, by "
-            f"{percent(loaded)} of the peak stress."
-        )
+        by = f"by {percent(loaded)} of the peak stress"
+        notes.append(f"Check: the specimen stays under load between the cycles, {by}.")
     moved = record.shifted("stress", offset).shifted("displacement", contact)
     moved = moved if record.time is None else moved.shifted("time", time)
     moved = replace(
@@ -226,12 +222,11 @@ def _before(record: Record, earlier: list[Cycle], last: int) -> tuple[Array, Arr
     """Return times and motion of the last cycles up to a row, with their turning points."""
     if record.time is None:
         return None
-    assert record.displacement is not None
     kept = earlier[-_REMEMBERED:]
     turns = [row for one in kept for row in (one.first, one.top)]
     rows = np.linspace(turns[0], last, _PER_CYCLE * len(kept)).astype(int)
     rows = np.unique([*rows, *turns])
-    return record.time[rows], record.displacement[rows]
+    return record.time[rows], record.curves()["displacement"][rows]
 
 
 def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
@@ -259,10 +254,8 @@ def _offset_note(when: str, zero: float) -> str:
 
 def _level_between(record: Record, cycles: list[Cycle], place: int) -> tuple[float, float]:
     """Return the stress at the lowest displacements between two peaks, and its standard error."""
-    w, between = record.displacement, slice(cycles[place].top, cycles[place + 1].top)
-    assert w is not None  # it has cycles
-    lowest = w[between] <= w[between].min() + _LOWEST * np.ptp(w)
-    rest = record.stress[between][lowest]
+    between, w = slice(cycles[place].top, cycles[place + 1].top), record.curves()["displacement"]
+    rest = record.stress[between][w[between] <= w[between].min() + _LOWEST * np.ptp(w)]
     return float(np.median(rest)), float(np.std(rest)) / float(np.sqrt(rest.size))
 
 

@@ -40,9 +40,7 @@ class EnergyAudit:
     def as_dict(self) -> dict[str, float | str | None]:
         """Return the audit as plain values; `missing` and `warnings` are joined to one text."""
         texts = {"missing": " ".join(self.missing), "warnings": " ".join(self.warnings())}
-        plain = asdict(self) | texts
-        del plain["contradictions"]
-        return plain
+        return {k: v for k, v in (asdict(self) | texts).items() if k != "contradictions"}
 
     def warnings(self) -> list[str]:
         """Return one sentence for each contradiction and each balance that does not close."""
@@ -51,20 +49,16 @@ class EnergyAudit:
 
     def energy_warnings(self) -> list[str]:
         """Return a sentence if the foam absorbs another energy than the striker brings."""
-        found, taken = [], self.absorbed_over_striker
-        if self.damping is not None:  # which takes up energy
+        taken, brought = self.absorbed_over_striker, "the energy that the striker brings"
+        if taken is None or 0.9 <= taken <= 1.05 or self.damping is not None:  # that takes it up
             return []
-        if taken is not None and taken > 1.05:
-            found.append(
-                f"Check: the foam absorbs {taken:.2f} times the energy that the striker brings, "
-                "which is impossible; mass, velocity, force and motion do not agree."
-            )
-        elif taken is not None and taken < 0.9:
-            found.append(
-                f"Check: the foam absorbs only {taken:.2f} of the energy that the striker brings; "
-                "mass, velocity, force and motion do not agree, or the record ends too early."
-            )
-        return found
+        if taken > 1.05:
+            how = f"{taken:.2f} times {brought}, which is impossible"
+            wrong = "mass, velocity, force and motion do not agree"
+        else:
+            how = f"only {taken:.2f} of {brought}"
+            wrong = "mass, velocity, force and motion do not agree, or the record ends too early"
+        return [f"Check: the foam absorbs {how}; {wrong}."]
 
     def loop_warnings(self) -> list[str]:
         """Return a sentence if the loop gives out energy."""

@@ -78,7 +78,6 @@ def find_outliers(values: Array, time: Array | None = None) -> Mask:
 
 
 def _bridged(values: Array, wrong: Mask, time: Array) -> Array:
-    """Replace wrong samples by linear interpolation."""
     return np.where(wrong, np.interp(time, time[~wrong], values[~wrong]), values)
 
 
@@ -269,17 +268,16 @@ def fresh_samples(values: NDArray[Any]) -> tuple[Integers, Integers]:
 
 
 def is_staircase(values: Array) -> bool:
-    """Return whether most samples repeat the previous one, and not for a coarse digitiser."""
-    fresh, lengths = fresh_samples(values)
-    return bool(np.median(lengths) >= 2) and not _is_coarse(values[fresh])
+    """Return whether most samples repeat the previous one, and not for a coarse digitiser.
 
-
-def _is_coarse(fresh: Array) -> bool:
-    """Return whether a value usually changes by a single step of its digitiser."""
-    steps = np.abs(np.diff(fresh))
-    gaps = np.diff(np.unique(fresh))
-    gaps = gaps[gaps > 1e-6 * float(np.ptp(fresh))] if gaps.size else gaps
-    return bool(gaps.size and steps.size and np.median(steps) < 1.5 * gaps.min())
+    Its values usually change by a single step.
+    """
+    at, lengths = fresh_samples(values)
+    if np.median(lengths) < 2:
+        return False
+    steps, gaps = np.abs(np.diff(values[at])), np.diff(np.unique(values[at]))
+    gaps = gaps[gaps > 1e-6 * float(np.ptp(values))]
+    return not (gaps.size and np.median(steps) < 1.5 * gaps.min())
 
 
 def noise_of_held(record: Record) -> dict[str, NoiseLevel]:

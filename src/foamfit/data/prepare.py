@@ -20,7 +20,6 @@ from foamfit.data.measurement import (
     Dropped,
     Measurement,
     Noise,
-    NoiseLevel,
     Outliers,
     Record,
     RowCount,
@@ -118,7 +117,9 @@ def condition(
     record = blocks.thin(whole, block)
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: blocks.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
-    noise |= _of_velocity(whole, impact=impact)
+    if is_velocity(whole) and (impact or "stress" in whole.derived):  # else it shows its noise
+        velocity = whole.curves("velocity")["velocity"]
+        noise["displacement"] = noise_of_integral(whole.instants, velocity)
     test = _measured(
         whole, record, block, excess, specimen=specimen, striker=striker and given, flight=flight,
         noise=replace(_stated_of_blocks(stated or Noise(), levels, whole, block), estimated=noise),
@@ -137,19 +138,6 @@ def _on_clock(rise: contact.Kink, record: Record, block: int, first: int) -> con
     if record.time is not None:
         return rise[0] - record.origins.get("contact_time", 0.0), rise[1]
     return (rise[0] - first - 0.5 * (block - 1)) / block, rise[1] / block
-
-
-def _of_velocity(record: Record, *, impact: bool) -> dict[str, NoiseLevel]:
-    """Return the noise of a motion that was integrated from a velocity.
-
-    A slow record of force and velocity shows the noise of its motion itself.
-    """
-    if not is_velocity(record) or not (impact or "stress" in record.derived):
-        return {}
-    assert record.time is not None
-    assert record.velocity is not None
-    step = float(np.median(np.diff(record.time)))
-    return {"displacement": noise_of_integral(record.velocity, step)}
 
 
 def _stated_of_blocks(stated: Noise, levels: contact.Levels, record: Record, block: int) -> Noise:
@@ -326,8 +314,7 @@ def stress_of_motion(
 
 def start_within_height(record: Record, specimen: Specimen, striker: Striker) -> Record:
     """Delay the contact of an impact if the displacement would otherwise exceed the height."""
-    w, most = record.displacement, 0.97 * specimen.height
-    assert w is not None  # measured or integrated by now
+    w, most = record.curves()["displacement"], 0.97 * specimen.height
     over, limit = float(w.max()) - most, 0.5 if "stress" in record.derived else 0.2
     if not striker.velocity or not 0.03 * specimen.height <= over < limit * specimen.height:
         return record
@@ -347,8 +334,7 @@ def checks(
     record: Record, specimen: Specimen, striker: Striker, *, several: bool = False
 ) -> Record:
     """Reject strains beyond one, note implausible data (no reversals of `several` cycles)."""
-    displacement, height = record.displacement, specimen.height
-    assert displacement is not None  # measured or integrated by now
+    displacement, height = record.curves()["displacement"], specimen.height
     notes, motion = list[str](), record.motion
     if motion != MEASURED:
         notes.append(f"The file has no displacement: the motion is {motion}.")

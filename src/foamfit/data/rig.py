@@ -249,30 +249,24 @@ def candidates(rig: Rig, test: Measurement, springs: int) -> list[Candidate]:
     for mass, speed, node in product(rig.masses, speeds, inner):
         out.append(Candidate("impact", mass, float(f"{speed:.4g}"), interior=node))
     if rig.rates[0] > 0.0:
-        counts = sorted({1, rig.cycles})
         grid = _spread(rig.strain, STRAINS), _spread(rig.rates, RATES)
-        for strain, rate, cycles in product(*grid, counts):
+        for strain, rate, cycles in product(*grid, sorted({1, rig.cycles})):
             out.append(Candidate("displacement", strain=strain, rate=rate, cycles=cycles))
         for strain, rate in product(grid[0], grid[1] if rig.hold else ()):
             out.append(Candidate("displacement", strain=strain, rate=rate, hold=rig.hold))
-    return [*out, *filter(None, [_again(test, rig)])]
+    striker, own = test.striker, loading_rate(test)
+    if striker is not None and striker.mass and striker.velocity:
+        out.append(Candidate("impact", striker.mass, striker.velocity, repeat=True))
+    elif test.displacement is not None and own is not None and rig.rates[0] > 0.0:
+        largest = float(np.max(test.displacement)) / test.specimen.height
+        out.append(Candidate("displacement", strain=largest, rate=own, repeat=True))
+    return out
 
 
 def _spread(ends: Range, count: int) -> list[float]:
     """Return values spread evenly in ratio over a range."""
     values = np.geomspace(*ends, count if ends[1] > ends[0] else 1)
     return [float(f"{value:.3g}") for value in values]
-
-
-def _again(test: Measurement, rig: Rig) -> Candidate | None:
-    """Return a repeat of the test at hand."""
-    striker, rate = test.striker, loading_rate(test)
-    if striker is not None and striker.mass and striker.velocity:
-        return Candidate("impact", striker.mass, striker.velocity, repeat=True)
-    if test.displacement is None or rate is None or not rig.rates[0] > 0.0:
-        return None
-    strain = float(np.max(test.displacement)) / test.specimen.height
-    return Candidate("displacement", strain=strain, rate=rate, repeat=True)
 
 
 def read_rig(path: Path | None, test: Measurement, *, relaxing: bool = False) -> Rig:

@@ -20,6 +20,7 @@ import math
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -213,19 +214,18 @@ def checked(
 _FILE = Rule(
     lambda v: isinstance(v, str) and v.strip() != "" and "\0" not in v, 'a file, like "camera.csv"'
 )
+_stated = partial(Quantity, uncertain=True)
 _SECTIONS: dict[str, dict[str, Check]] = {
     "specimen": {
-        "height": Quantity("m", "1.19 mm", uncertain=True),
-        "diameter": Quantity("m", "5 mm", uncertain=True),
-        "area": Quantity("m**2", "19.6 mm^2", uncertain=True),
-        "mass": Quantity("kg", "5.56 mg", uncertain=True),
-        "heights": Several(
-            Quantity("m", "0.7 mm", uncertain=True), 'like ["0.700 mm", "0.490 mm"], base first'
-        ),
+        "height": _stated("m", "1.19 mm"),
+        "diameter": _stated("m", "5 mm"),
+        "area": _stated("m**2", "19.6 mm^2"),
+        "mass": _stated("kg", "5.56 mg"),
+        "heights": Several(_stated("m", "0.7 mm"), 'like ["0.700 mm", "0.490 mm"], base first'),
     },
     "striker": {
-        "mass": Quantity("kg", "7 g", uncertain=True),
-        "velocity": Quantity("m/s", "1.75 m/s", uncertain=True),
+        "mass": _stated("kg", "7 g"),
+        "velocity": _stated("m/s", "1.75 m/s"),
         "gravity": FLAG,
     },
     "noise": {"stress": Quantity("Pa", "20 kPa"), "displacement": Quantity("m", "2 um")},
@@ -241,7 +241,7 @@ _SECTIONS: dict[str, dict[str, Check]] = {
     },
     "motion": {
         "file": _FILE,
-        "delay": Quantity("s", "0 ± 50 us", positive=False, uncertain=True),
+        "delay": _stated("s", "0 ± 50 us", positive=False),
         "columns": anything,
     },
 }
@@ -300,17 +300,14 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
             striker["gravity"] = GRAVITY if striker["gravity"] else 0.0
         return Settings(
             name=_NAME(document.get("name", printable(toml_beside(test).stem)), "name"),
-            specimen=_specimen(values["specimen"], spreads),
+            specimen=_specimen(values["specimen"], spreads), uncertainties=spreads,
             striker=Striker(**striker) if striker else None,
-            noise=Noise(**values["noise"]),
-            window=Window(**window),
+            noise=Noise(**values["noise"]), window=Window(**window), **values["data"],
             columns=_columns(table_of(document, "columns"), channels),
-            uncertainties=spreads,
             motion=_motion(path, values["motion"]) if "motion" in document else None,
             # Its keys depend on the model; the fit checks them.
             priors={key: _PRIOR(value, f"[priors] {key}") for key, value in priors.items()},
-            **values["data"],
-        )
+        )  # fmt: skip
 
 
 def _split(tables: dict[str, dict[str, Any]]) -> tuple[dict[str, dict[str, Any]], dict[str, float]]:
@@ -364,7 +361,6 @@ def motion_file(toml: Path) -> Path | None:
 
 
 def _motion(path: Path, values: dict[str, Any]) -> Motion:
-    """Return the motion in a file of its own."""
     if "file" not in values:
         raise InputError(f"[motion] file is missing; it must be {_FILE.right}.")
     columns = _columns(table_of(values, "columns", "motion."), MOTION_CHANNELS, "motion.columns")

@@ -229,8 +229,7 @@ def _zero_of_motion(
     The zero of the file is kept if nothing was recorded before contact, unless it is clearly wrong,
     and in a slow test whose record starts under load.
     """
-    time, values, first = record.instants, record.channel(name), start.first
-    assert values is not None  # the channel exists
+    time, values, first = record.instants, record.curves()[name], start.first
     top = name == "displacement"
     rows = n if n >= _FEWEST else max(0, first - 2)
     if rows >= _FEWEST and (not top or start.gauge == "rest"):

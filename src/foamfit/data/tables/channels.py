@@ -48,8 +48,8 @@ class Channels:
         for channel, values in self.numbers.items():
             if measure := self.source.measure(channel):
                 self.numbers[channel] = engineering_strain(measure, values)
-                told = f"The strain is converted from the {measure} strain"
-                self.notes.append(f"{told} {self.source.name(channel)}.")
+                was = f"{measure} strain {self.source.name(channel)}"
+                self.notes.append(f"The strain is converted from the {was}.")
         return self.numbers
 
 
@@ -76,9 +76,8 @@ def read_channels(
     # Some instruments write the number of samples into the header.
     for row, line in enumerate(table.content.split("\n", table.first_row)[: table.first_row], 1):
         match = re.match(r"\W*(?:number of )?samples\W+(\d+)", line, re.IGNORECASE | re.ASCII)
-        if match and int(match[1]) != rows.size:
-            counts = f"{int(match[1])} samples, the table has {rows.size}"
-            notes.append(f"Check: row {row} announces {counts}.")
+        if match and (said := int(match[1])) != rows.size:
+            notes.append(f"Check: row {row} announces {said} samples, the table has {rows.size}.")
             break
     dropped = [*cut, *dropped]
     if "time" in numbers:
@@ -132,23 +131,22 @@ def _evenly(time: Array) -> Array | None:
     places = np.arange(time.size)
     slope, start = np.polyfit(places, time, 1)
     even = start + slope * places
-    steps = np.diff(np.unique(time))
-    return even if np.ptp(time - even) < 1.2 * np.median(steps) else None
+    return even if np.ptp(time - even) < 1.2 * np.median(np.diff(np.unique(time))) else None
 
 
 def check_time(time: Array, name: str, rows: Integers) -> None:
     """Raise InputError unless the time increases from row to row."""
     back = np.flatnonzero(np.diff(time) <= 0)
-    if back.size:
-        i = int(back[0]) + 1
-        wrong, more = "goes back", ""
-        if time[i] == time[i - 1]:
-            more = ' (in a test, [data] duplicates = "average" averages rows with the same stamp)'
-            wrong = "repeats"
-        elif len(back) > len(time) / 2:
-            more = "; as the record runs backwards, reverse the order of its rows"
-        where = f"row {rows[i]}, column {name}"
-        raise InputError(f"{where}: time {wrong}; it must increase from row to row{more}.")
+    if not back.size:
+        return
+    i, wrong, more = int(back[0]) + 1, "goes back", ""
+    if time[i] == time[i - 1]:
+        more = ' (in a test, [data] duplicates = "average" averages rows with the same stamp)'
+        wrong = "repeats"
+    elif len(back) > len(time) / 2:
+        more = "; as the record runs backwards, reverse the order of its rows"
+    where = f"row {rows[i]}, column {name}"
+    raise InputError(f"{where}: time {wrong}; it must increase from row to row{more}.")
 
 
 def turn_negative(parts: list[Channels], window: Window) -> tuple[str, ...]:
@@ -158,18 +156,15 @@ def turn_negative(parts: list[Channels], window: Window) -> tuple[str, ...]:
     if the TOML states this sign, or if the record does not show which channel is wrong.
     """
     owners = {c: part for part in parts for c in part.numbers if c not in ("time", "cycle")}
-    channels, time = (
-        {c: part.numbers[c] for c, part in owners.items()},
-        parts[0].numbers.get("time"),
-    )
+    channels = {c: part.numbers[c] for c, part in owners.items()}
+    time = parts[0].numbers.get("time")
     if time is not None:
-        first = max(window.start, *(part.numbers["time"][0] + part.delay for part in parts))
-        last = min(window.end, *(part.numbers["time"][-1] + part.delay for part in parts))
-        inside = (time >= first) & (time <= last)
-        if inside.sum() < MIN_ROWS:
-            return ()  # refused later
         clocks = {part.section: part.numbers["time"] + part.delay for part in parts}
-        time = time[inside]
+        first = max(window.start, *(clock[0] for clock in clocks.values()))
+        last = min(window.end, *(clock[-1] for clock in clocks.values()))
+        time = time[(time >= first) & (time <= last)]
+        if time.size < MIN_ROWS:
+            return ()  # refused later
         for channel, part in owners.items():
             channels[channel] = np.interp(time, clocks[part.section], channels[channel])
     wrong, certain = negative_channels(channels, time)

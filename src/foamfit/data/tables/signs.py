@@ -17,8 +17,8 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.cycles import find_turns
-from foamfit.data.noise import noise_level
-from foamfit.data.outliers import inner_samples
+from foamfit.data.noise import integrated_twice, noise_level
+from foamfit.data.outliers import fresh_samples, inner_samples
 
 FORCES = "stress", "force", "acceleration"  # the preferred one first
 MOTIONS = "displacement", "strain"
@@ -62,8 +62,12 @@ def negative_channels(channels: Mapping[str, Array], time: Array | None) -> tupl
         if other and channel not in (other, "velocity"):
             opposite = np.dot(values - values.mean(), upright[other] - upright[other].mean()) < 0.0
             wrong += [channel] * bool(opposite)
-    if time is not None and "velocity" in upright and _against(upright, motion, time[kept]):
-        wrong.append("velocity")
+    if time is not None and (velocity := upright.get("velocity")) is not None:
+        if motion:  # whose derivative it is
+            against = np.dot(np.gradient(upright[motion], time[kept]), velocity) < 0.0
+        else:  # its integral rises first
+            against = _falls(integrated_twice(time[kept], velocity)[0])
+        wrong += ["velocity"] * bool(against)
     return wrong, True
 
 
@@ -87,11 +91,9 @@ def _signs(force: Array, motion: Array) -> tuple[int, int] | None:
     work = float(np.dot(steps, np.maximum(load, 0.0)))
     # A mean weighted by the load itself does not depend on motion without load.
     mean = float(np.dot(steps, np.maximum(load, 0.0) ** 2)) / work if work else 0.0
-    one_sided = (
-        steps[load < -_LOADED * mean].sum() < _ONE_SIDED * steps[load > _LOADED * mean].sum()
-    )
+    under, against = (float(steps[s * load > _LOADED * mean].sum()) for s in (1, -1))
     agree = same * sum(run.work for run in runs) >= _AGREE * sum(abs(run.work) for run in runs)
-    if one_sided and agree and zero + mean > 0.0:
+    if against < _ONE_SIDED * under and agree and zero + mean > 0.0:
         return sign, towards
     return (1, 1) if same > 0 else None
 
@@ -129,8 +131,7 @@ def _pulse_is_negative(force: Array) -> bool:
     level = force - np.median(force[: max(5, force.size // 200)])
     size = float(np.dot(level, level)) / max(float(np.abs(level).sum()), 1e-300)
     sides = np.sign(level) * (np.abs(level) > max(_PULSE * size, _NOISE * noise_level(force)))
-    starts = np.append(0, np.flatnonzero(np.diff(sides)) + 1)
-    impulses = np.add.reduceat(np.abs(sides) * level, starts)
+    impulses = np.add.reduceat(np.abs(sides) * level, fresh_samples(sides)[0])
     considerable = np.abs(impulses) >= _FIRST * np.abs(impulses).max()
     first, total = impulses[int(np.argmax(considerable))], float(np.abs(impulses).sum())
     return bool(first < 0.0 and impulses.sum() < -_AGREE * total)
@@ -141,15 +142,3 @@ def _falls(motion: Array) -> bool:
     low = int(np.argmin(motion))
     fallen, risen = motion[0] - motion[low], motion[: low + 1].max() - motion[0]
     return bool(low < 0.98 * motion.size and fallen > max(2 * risen, 0.3 * np.ptp(motion)))
-
-
-def _against(channels: Mapping[str, Array], motion: str, time: Array) -> bool:
-    """Return whether a velocity is negative in compression.
-
-    It is the derivative of the motion; without a motion, its integral rises first.
-    """
-    velocity = channels["velocity"]
-    if motion:
-        return bool(np.dot(np.gradient(channels[motion], time), velocity) < 0.0)
-    steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time)
-    return _falls(np.append(0.0, np.cumsum(steps)))
