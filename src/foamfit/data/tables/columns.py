@@ -18,7 +18,7 @@ from foamfit.text import listed, percent
 _MOTIONS = "displacement", "strain"
 TWINS = {"stress": "force", "force": "stress", "displacement": "strain", "strain": "displacement"}
 # Channels that stress and displacement are read from, the preferred one first.
-_SOURCES = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIONS}
+SOURCES = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIONS}
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class Source:
 
     def _used(self) -> dict[str, str]:
         """Return the channels that stress and displacement are read from."""
-        present = {n: [c for c in cs if c in self.columns] for n, cs in _SOURCES.items()}
+        present = {n: [c for c in cs if c in self.columns] for n, cs in SOURCES.items()}
         return {name: channels[0] for name, channels in present.items() if channels}
 
     def _over(self, channel: str) -> bool:
