@@ -152,7 +152,6 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
 
 
 def _read_motion(path: Path, toml: Path, motion: Motion, duplicates: str) -> Channels:
-    """Read the channels of the file named in [motion]."""
     if os.path.realpath(motion.file) == os.path.realpath(path):
         raise InputError(
             f"{toml}: [motion] file = {motion.file.name!r} is the file of the force; name one of "

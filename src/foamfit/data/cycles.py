@@ -136,20 +136,18 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
         named, used = f"Cycle {number}", "is used"
         if cycle.last is not None:
             named, used = f"Cycles {number} to {cycle.last}", "are used as one history"
-        notes.append(
-            f"{named}{order} of {n} {used}: {end - start} of {len(record)} "
-            f"samples, {start} before and {len(record) - end} after are cut."
-        )
+        cut = f"{start} before and {len(record) - end} after are cut"
+        rows = f"{end - start} of {len(record)} samples"
+        notes.append(f"{named}{order} of {n} {used}: {rows}, {cut}.")
     largest = max(cycles, key=lambda c: float(w[c.top])).number
     share = (w[top] - w.min()) / size
     if share < _SMALLER and cycle.last is None:
+        how = f"--cycle {largest}, or [window] cycle = {largest}"
         notes.append(
             f"Check: cycle {number} reaches {percent(share)} of the largest displacement; "
-            f"cycle {largest} of {n} reaches all of it (--cycle {largest}, or [window] cycle = "
-            f"{largest})."
+            f"cycle {largest} of {n} reaches all of it ({how})."
         )
-    last = cycle.turn
-    if end == len(record) and w[last] - w[last:].min() <= _UNLOADED * size:
+    if end == len(record) and w[cycle.turn] - w[cycle.turn :].min() <= _UNLOADED * size:
         notes.append("The record has no unloading, so the unloading is undetermined.")
     after = f"after cycle {cycle.last or number}"
     return record.noted(*notes).between(start, end, f"before cycle {number}", after)

@@ -159,10 +159,9 @@ class Entry:
     def _line(self, scale: str) -> str:
         scale = f'"{scale} {self.scale_unit}"' if self.scale_unit else scale
         more = f', unit = "{self.unit}"' * bool(self.unit) + f", scale = {scale}" * bool(scale)
+        more += ", counts_down = true" * self.counts_down
         column = json.dumps(self.column, ensure_ascii=False) + more
-        return (
-            f"{self.channel} = {{ column = {column}{', counts_down = true' * self.counts_down} }}"
-        )
+        return f"{self.channel} = {{ column = {column} }}"
 
     def times(self, factor: float, within: float) -> str:
         """Return the line for a channel larger by a factor, rounded `within` a share of it."""

@@ -174,9 +174,8 @@ class Candidate:
         striker = None
         if self.drive == "impact":
             time = np.linspace(0.0, lasts, IMPACT_SAMPLES)
-            moved: Array | None = np.linspace(0.0, 0.5 * height, time.size)
-            alone = test.displacement is None and test.striker is not None
-            moved = None if alone and not with_motion else moved
+            alone = test.displacement is None and test.striker is not None and not with_motion
+            moved = None if alone else np.linspace(0.0, 0.5 * height, time.size)
             striker = replace(test.striker or Striker(), mass=self.mass, velocity=self.velocity)
             was = test.striker and test.striker.velocity
             if was and self.velocity and "velocity" in spreads:
@@ -187,7 +186,7 @@ class Candidate:
             channel: NoiseLevel(sigma, getattr(known, channel) is not None, "the rig")
             for channel, sigma in rig.noise.items()
         }
-        seen = {*test.interior, *([] if self.interior is None else [self.interior])}
+        seen = {*test.interior, *filter(None, [self.interior])}
         ramp = np.linspace(0.0, 1.0, time.size)
         levels |= {interior_channel(node): levels["displacement"] for node in seen}
         if striker is None:
@@ -264,7 +263,6 @@ def candidates(rig: Rig, test: Measurement, springs: int) -> list[Candidate]:
 
 
 def _spread(ends: Range, count: int) -> list[float]:
-    """Return values spread evenly in ratio over a range."""
     values = np.geomspace(*ends, count if ends[1] > ends[0] else 1)
     return [float(f"{value:.3g}") for value in values]
 
@@ -284,7 +282,6 @@ def read_rig(path: Path | None, test: Measurement, *, relaxing: bool = False) ->
 
 
 def _completed(stated: dict[str, dict[str, Any]], test: Measurement, relaxing: bool) -> Rig:
-    """Return the rig, completed from a record."""
     test, notes = with_noise(test), list[str]()
     hits, machine, limits, record = (stated[name] for name in _RIG)
 

@@ -130,17 +130,14 @@ def take_zeros(
             unit = UNITS[name]
             tail = tail_level(values, noise) if impact and n < _FEW else None
             if tail is not None and tail.samples > n:
-                zero = tail
-                note = (
-                    f"The {name} at the end of the record, {engineering(zero.value, unit)}, is "
-                    "taken off as the sensor's offset (the striker has left in the last "
-                    f"{zero.samples} rows)."
-                )
+                zero, left = tail, f"the striker has left in the last {tail.samples} rows"
+                note = f"The {name} at the end of the record, {engineering(zero.value, unit)}, is "
+                note += f"taken off as the sensor's offset ({left})."
             elif n >= _FEWEST:
                 zero, note = _zero_at_rest(name, values[:n], unit, np.ptp(values), noise)
             elif start.first:
-                note = f"Only {n} rows are certainly before contact: the zero of the {name} in the "
-                note += "file is kept."
+                kept = f"the zero of the {name} in the file is kept"
+                note = f"Only {n} rows are certainly before contact: {kept}."
             if zero.samples:
                 steps = _of_steps(values, values[:n])
                 errors[name] = float(np.hypot(zero.error, steps))
@@ -208,8 +205,8 @@ def _zero_at_rest(
     if abs(rise) > max(0.01 * size, 4 * slope.error * n):
         kept = abs(zero.value) <= abs(rise)
         done = "no offset is taken off" if kept else "its zero is as uncertain"
-        drift = engineering(rise, unit)
-        note = f"The {name} drifts by {drift} in the {n} samples before contact, so {done}. "
+        note = f"The {name} drifts by {engineering(rise, unit)} in the {n} samples before contact, "
+        note += f"so {done}. "
         zero = Level(0.0 if kept else zero.value, float(np.hypot(zero.error, rise)), n)
     if zero.value:
         ratio = f", {abs(zero.value) / scatter:.2g} times that" if scatter > 0 else ""
@@ -274,10 +271,8 @@ def mark_flight(record: Record, start: Start, span: Span, levels: Levels) -> Rec
     are then not compared.
     """
     touching = np.arange(len(record)) < span.leaves - span.first
-    inner = {
-        name: record.sampled.get(name, touching) & touching
-        for name in map(interior_channel, record.interior)
-    }
+    inside = map(interior_channel, record.interior)
+    inner = {name: record.sampled.get(name, touching) & touching for name in inside}
     record = replace(record, sampled=record.sampled | inner)
     if record.displacement is None or start.gauge in ("flight", ""):
         return record
@@ -300,23 +295,22 @@ def flight_of(
     flight with its standard error, m/s, or None, and notes.
     """
     n, w, given, notes = start.first - 2, record.displacement, striker.velocity, list[str]()
-    flight = None
     if not given:
-        return striker, flight, notes
+        return striker, None, notes
+    flight = None
     gain = percent(share := GRAVITY * float(record.instants[span.end - 1] - start.time) / given)
     if w is not None and n >= 8:
         noise, t = levels["displacement"], record.instants[:n] - start.time
         gravity, error = (2.0 * half for half in _bend(t, w[:n], noise))
         none = start.gauge == "flight" and 4.0 * error < GRAVITY
         if falls := gravity > 4.0 * error and abs(gravity - GRAVITY) < 0.2 * GRAVITY + 2.0 * error:
-            text = (
-                f"before contact the striker accelerates by {engineering(gravity, 'm/s²')}: it "
-                f"falls, and gains {gain} of its velocity over the contact"
-            )
+            starts, ends = "Before", ". The fit includes gravity."
             if striker.gravity == 0.0:
-                notes.append(f"Check: {text}, but [striker] gravity is false.")
-            else:
-                notes.append(f"{text[0].upper()}{text[1:]}. The fit includes gravity.")
+                starts, ends = "Check: before", ", but [striker] gravity is false."
+            notes.append(
+                f"{starts} contact the striker accelerates by {engineering(gravity, 'm/s²')}: it "
+                f"falls, and gains {gain} of its velocity over the contact{ends}"
+            )
         if striker.gravity is None and (falls or none):
             striker = replace(striker, gravity=GRAVITY if falls else 0.0)
         fall = 0.5 * (striker.gravity or 0.0) * t**2
