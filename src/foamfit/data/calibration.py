@@ -59,23 +59,15 @@ class Balance:
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A number that the record contradicts.
+    """A number that the record contradicts; a clause `says` what contradicts what.
 
-    Attributes
-    ----------
-    quantity
-        "velocity", "force_scale", "motion_scale" or "time_shift".
-    ratio, limit
-        Number that the record shows over the number in use, and the largest difference of this
-        ratio from 1 of numbers that agree. Of a time shift, the delay of the motion against the
-        force, s, and the largest one that may be noise of the record.
-    says
-        What contradicts what, a clause.
-    lines
-        Tables and lines of the TOML, each of which would settle it, the likelier one first.
+    `ratio` is the number that the record shows over the number in use, `limit` the largest
+    difference of this ratio from 1 of numbers that agree. Of a time shift, they are the delay of
+    the motion against the force, s, and the largest one that may be noise of the record. `lines`
+    are tables and lines of the TOML, each of which would settle it, the likelier one first.
     """
 
-    quantity: str
+    quantity: str  #: "velocity", "force_scale", "motion_scale" or "time_shift"
     ratio: float
     limit: float
     says: str
@@ -90,10 +82,7 @@ class Contradiction:
 
 
 def contradictions(test: Measurement, shown: Balance | None = None) -> tuple[Contradiction, ...]:
-    """Return the numbers that the record of an impact contradicts, the velocity first.
-
-    `shown` is its `balance`, if that is known.
-    """
+    """Return the numbers that a record contradicts, the velocity first; `shown`: its `balance`."""
     shown = balance(test) if shown is None else shown
     found = _of_striker(test, shown)
     if shown.delay is not None and test.time is not None:

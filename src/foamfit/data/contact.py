@@ -320,16 +320,9 @@ def rise_of(
     slope, a parabola and a cubic, none of them negative. The probability of each trial time follows
     from its sum of squares: a rise that begins softly leaves the contact open, a kink does not.
 
-    Parameters
-    ----------
-    time, values : (n,) array
-        s (or sample numbers) and the channel, positive in compression, zero taken off.
-    noise : NoiseLevel
-        Noise of the channel; the scatter at rest is used instead if it is larger.
-    rest : int
-        Number of rows before any contact.
-    zero : float, optional
-        Standard error of the zero; None if it was not measured.
+    Time, s (or sample numbers), and values, zero taken off, are of shape (n,). The first `rest`
+    rows are before any contact; their scatter is used if it is larger than the `noise`. `zero` is
+    the standard error of the zero, None if it was not measured.
     """
     top = int(np.argmax(values))
     up, sigma, tau = values[: top + 1], noise.sigma, noise.time

@@ -228,15 +228,12 @@ def _before(record: Record, earlier: list[Cycle], last: int) -> tuple[Array, Arr
 
 
 def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
-    """Use a stress significantly below zero after the first of several cycles as its zero.
-
-    A preloaded specimen may become free only after the first cycle.
-    """
+    """Use a stress significantly below zero after the first of several cycles as its zero."""
     if cycle.last is None:
         return record
+    # A preloaded specimen may become free only after the first cycle.
     zero, error = _level_between(record, cycles, cycle.place)
-    between = record.stress[cycles[cycle.place].top : cycles[cycle.place + 1].top]
-    tension = min(zero, lowest_mean(between, 0)[0])
+    tension = min(zero, lowest_mean(record.stress[cycle.top : cycles[cycle.place + 1].top], 0)[0])
     if zero > -_SURE * error or _is_glued(record, tension, float(record.stress[cycle.top])):
         return record
     record = replace(record.shifted("stress", zero), zeros=record.zeros | {"stress": error})
@@ -258,11 +255,8 @@ def _level_between(record: Record, cycles: list[Cycle], place: int) -> tuple[flo
 
 
 def _is_glued(record: Record, level: float, peak: float) -> bool:
-    """Return whether a stress between cycles is tension that only a glued specimen bears.
-
-    It is not the sensor's offset, as the zero was measured before contact.
-    """
-    error = record.zeros.get("stress", np.inf)
+    """Return whether a stress between cycles is tension that only a glued specimen bears."""
+    error = record.zeros.get("stress", np.inf)  # finite if the zero was measured before contact
     return level < -max(TENSION * peak, _SURE * error)
 
 

@@ -302,18 +302,10 @@ class _Modes:
 
 @dataclass(frozen=True, eq=False)
 class SmoothMotion:
-    """A motion without noise.
+    """A motion without noise."""
 
-    Attributes
-    ----------
-    turns : (k,) array
-        Times at which the motion turns, s.
-    sigma : float
-        Standard deviation of the noise, m.
-    """
-
-    turns: Array
-    sigma: float
+    turns: Array  #: times at which the motion turns, s, (k,)
+    sigma: float  #: standard deviation of the noise, m
     _curve: PPoly
     _modes: _Modes
     _start: float
@@ -352,16 +344,13 @@ def follow(
 
 @lru_cache(maxsize=32)
 def _cached(raw_times: bytes, raw_motion: bytes, noise: NoiseLevel) -> SmoothMotion:
-    """Run `follow` with its arrays as bytes, which can be cached.
-
-    Where samples are very uneven, as in a long hold with few of them, no spline follows them all;
-    the motion is then that of the samples.
-    """
+    """Run `follow` with its arrays as bytes, which can be cached."""
     times, w = np.frombuffer(raw_times), np.frombuffer(raw_motion)
     with suppress(linalg.LinAlgError):
         found = _found(times, w, noise)
         if _keeps_to(found, times, w):
             return found
+    # No spline follows very uneven samples, as in a long hold with few of them.
     return _exact(times, w, max(noise.sigma, residual_noise(w)[0]))
 
 

@@ -268,16 +268,13 @@ def fresh_samples(values: NDArray[Any]) -> tuple[Integers, Integers]:
 
 
 def is_staircase(values: Array) -> bool:
-    """Return whether most samples repeat the previous one, and not for a coarse digitiser.
-
-    Its values usually change by a single step.
-    """
+    """Return whether most samples repeat the previous one, and not for a coarse digitiser."""
     at, lengths = fresh_samples(values)
     if np.median(lengths) < 2:
         return False
     steps, gaps = np.abs(np.diff(values[at])), np.diff(np.unique(values[at]))
     gaps = gaps[gaps > 1e-6 * float(np.ptp(values))]
-    return not (gaps.size and np.median(steps) < 1.5 * gaps.min())
+    return not (gaps.size and np.median(steps) < 1.5 * gaps.min())  # usually by a single step
 
 
 def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
@@ -331,8 +328,8 @@ def find_standstills(record: Record) -> list[tuple[int, int]]:
         return found
     fresh, lengths = fresh_samples(w)
     noise, step = noise_level(w[fresh]), int(np.median(lengths))
-    shortest = max(_STEPS * step, _SAMPLES)
-    size, low = float(np.ptp(stress)), float(np.quantile(stress, 0.01))
+    shortest, size = max(_STEPS * step, _SAMPLES), float(np.ptp(stress))
+    low = float(np.quantile(stress, 0.01))
     for after, length in sorted(_jumps(w, noise, step, shortest).items()):
         last = after - length
         if found and last < found[-1][1]:

@@ -115,8 +115,8 @@ class Rig:
     @property
     def limits(self) -> str:
         """The limits in words."""
-        shown = [engineering(self.force, "N")] if math.isfinite(self.force) else []
-        shown += [engineering(self.displacement, "m")] if math.isfinite(self.displacement) else []
+        largest = (self.force, "N"), (self.displacement, "m")
+        shown = (engineering(most, unit) for most, unit in largest if math.isfinite(most))
         return listed([*shown, f"a strain of {self.largest_strain:g}"])
 
 
@@ -201,12 +201,8 @@ class Candidate:
         )  # fmt: skip
 
     def weight(self, time: Array, test: Measurement, rig: Rig) -> float:
-        """Return the number of samples of the rig per simulated sample.
-
-        A rate for impacts would be a thousand million rows in a slow test, which has as many per
-        cycle as the record at hand.
-        """
-        if rig.sampling is not None and self.mass is not None:
+        """Return the number of samples of the rig per simulated sample."""
+        if rig.sampling is not None and self.mass is not None:  # the rate of impacts
             return rig.sampling * float(time[-1] - time[0]) / time.size
         rows = test.rows.used if test.displacement is None else test.displacement.size
         return rows / max(len(test.cycles), 1) * self.cycles / time.size

@@ -144,8 +144,8 @@ def find_table(text: Text, names: set[str | int]) -> Table:
             "file must contain one table with one header."
         )
     if (longest := max(map(len, grid[i]))) > LONGEST:
-        wrong = f"row {row}: the name of a column has {longest} characters"
-        raise InputError(f"{wrong}; it must have {LONGEST} at most.")
+        most = f"{longest} characters; it must have {LONGEST} at most"
+        raise InputError(f"row {row}: the name of a column has {most}.")
     first, texts = _unit_row(grid, i)
     body = [cells for cells in grid[first:] if any(cells)]
     if not body:
