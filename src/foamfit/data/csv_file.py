@@ -153,10 +153,8 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
 
 def _read_motion(path: Path, toml: Path, motion: Motion, duplicates: str) -> Channels:
     if os.path.realpath(motion.file) == os.path.realpath(path):
-        raise InputError(
-            f"{toml}: [motion] file = {motion.file.name!r} is the file of the force; name one of "
-            "its own."
-        )
+        wrong = f"[motion] file = {motion.file.name!r} is the file of the force"
+        raise InputError(f"{toml}: {wrong}; name one of its own.")
     text = read_text(motion.file, f"in [motion] file of {toml.name} the CSV file of the motion")
     try:
         with naming(motion.file):
@@ -238,17 +236,13 @@ def _compare(source: Source, numbers: dict[str, Array], settings: Settings) -> l
             other = (values - values[0]) * as_used.get(channel, 1.0)
             other = one[0] + other * np.sign(np.dot(other, one - one[0]))
             by = percent(float(np.max(np.abs(other - one)) / np.ptp(one)))
-            notes.append(
-                f"The {channel} {name} is left out; it differs by up to {by} of the range."
-            )
+            notes += [f"The {channel} {name} is left out; it differs by up to {by} of the range."]
         elif np.diff(values).min() > 0 and np.ptp(values - one) > np.median(np.diff(one)):
             both = f"columns {table.name(source.columns['time'])} and {name} are times that differ"
             by = engineering(float(np.ptp(values - one)), "s")
             if settings.striker is not None:
-                raise InputError(
-                    f"{both} by {by}; name the right one in [columns], or put a "
-                    "motion with its own clock into a file of its own ([motion])."
-                )
+                other = "put a motion with its own clock into a file of its own ([motion])"
+                raise InputError(f"{both} by {by}; name the right one in [columns], or {other}.")
             notes.append(f"Check: {both} by {by}; the first is used.")
     return notes
 

@@ -95,18 +95,14 @@ def choose_cycles(cycles: list[Cycle], number: int | None, last: int | None) -> 
     first = _choose(cycles, number)
     if last is None or last == number:
         return first
+    wrong = f"cycles {number} to {last} cannot be taken"
     if first is None or len(cycles) == 1:
-        raise InputError(
-            f"cycles {number} to {last} cannot be taken: the record has no cycles to choose from; "
-            "leave them out."
-        )
+        raise InputError(f"{wrong}: the record has no cycles to choose from; leave them out.")
     end = _choose(cycles, last)
     assert end is not None  # there are cycles
     if end.place <= first.place:
-        raise InputError(
-            f"cycles {number} to {last} cannot be taken: cycle {last} comes before cycle {number} "
-            f"in the file; give them in order, like {last}-{number}."
-        )
+        wrong += f": cycle {last} comes before cycle {number} in the file"
+        raise InputError(f"{wrong}; give them in order, like {last}-{number}.")
     return replace(first, end=end.end, last=end.number, turn=end.top)
 
 
@@ -241,10 +237,8 @@ def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
 
 
 def _offset_note(when: str, zero: float) -> str:
-    return (
-        f"The stress {when}, {engineering(zero, 'Pa')}, is taken off as the sensor's offset: "
-        "without contact the specimen bears none."
-    )
+    free, value = "without contact the specimen bears none", engineering(zero, "Pa")
+    return f"The stress {when}, {value}, is taken off as the sensor's offset: {free}."
 
 
 def _level_between(record: Record, cycles: list[Cycle], place: int) -> tuple[float, float]:

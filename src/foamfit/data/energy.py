@@ -89,10 +89,8 @@ class EnergyAudit:
                 f"momentum {self.momentum_change:.4g} N·s (ratio {self.impulse_ratio:.2f})."
             )
         if self.damping is not None:
-            results.append(
-                "The striker's motion shows an onsite damper, "
-                f"η = {engineering(self.damping, 'Pa·s')}, whose force the sensor does not see."
-            )
+            by = f"an onsite damper, η = {engineering(self.damping, 'Pa·s')}"
+            results += [f"The striker's motion shows {by}, whose force the sensor does not see."]
         return [*results, *self.warnings(), *self.missing]
 
 

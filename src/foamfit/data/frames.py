@@ -60,10 +60,8 @@ def join(record: Record, frames: Frames) -> Record:
     assert time is not None  # a force without a time was rejected
     longest = max(np.ptp(time), np.ptp(frames.time))
     if (spread := frames.spread or 0.0) > longest:
-        raise InputError(
-            f"[motion] ± of delay = {engineering(spread, 's')} is longer than the record, "
-            f"{engineering(float(longest), 's')}; it must be shorter."
-        )
+        wrong = f"[motion] ± of delay = {engineering(spread, 's')} is longer than the record"
+        raise InputError(f"{wrong}, {engineering(float(longest), 's')}; it must be shorter.")
     at = frames.time + frames.delay
     slack = 1e-9 * longest  # for rounding
     outside = (time < at[0] - slack) | (time > at[-1] + slack)
@@ -73,10 +71,8 @@ def join(record: Record, frames: Frames) -> Record:
         few = f"overlaps in time with {count} samples of the force; at least {MIN_ROWS} are needed"
         shared = few if 0 < count < MIN_ROWS else "does not overlap in time with the force"
         spans = [" to ".join(engineering(float(t), "s") for t in c[[0, -1]]) for c in (time, at)]
-        raise InputError(
-            f"[motion] {frames.name} {shared}: the force is from {spans[0]}, the motion with its "
-            f"delay from {spans[1]}."
-        )
+        when = f"the force is from {spans[0]}, the motion with its delay from {spans[1]}"
+        raise InputError(f"[motion] {frames.name} {shared}: {when}.")
     record = record.without(outside, f"outside the time of {frames.name}").noted(str(frames))
     time = record.instants
     if lost := int(np.count_nonzero(~inside)):

@@ -225,10 +225,8 @@ def cut_to_window(record: Record, window: Window) -> Record:
     kept = int(inside.sum())
     if kept < MIN_ROWS:
         first, last = (engineering(float(t), "s") for t in record.time[[0, -1]])
-        raise InputError(
-            f"[window] start and end leave {kept} samples; at least {MIN_ROWS} between {first} and "
-            f"{last} are needed."
-        )
+        needed = f"at least {MIN_ROWS} between {first} and {last} are needed"
+        raise InputError(f"[window] start and end leave {kept} samples; {needed}.")
     note = f"[window] cut {len(record) - kept} of {len(record)} samples."
     record = record.without(~inside, "outside [window] start and end").noted(note)
     for name, values in record.curves().items():
@@ -324,10 +322,8 @@ def start_within_height(record: Record, specimen: Specimen, striker: Striker) ->
         record = record.shifted("displacement", over)
     else:  # an integrated motion has no zero in the file
         record = record.changed("displacement", w - over)
-    return record.noted(
-        f"Contact is assumed {engineering(late, 's')} later, so that the displacement does not "
-        "exceed the height."
-    )
+    done = f"Contact is assumed {engineering(late, 's')} later"
+    return record.noted(f"{done}, so that the displacement does not exceed the height.")
 
 
 def checks(
@@ -353,10 +349,8 @@ def checks(
     for value, (name, (low, high, unit)) in zip(sizes, _USUAL.items(), strict=True):
         if not low <= value <= high:
             shown, least, most = (f"{v:.4g} {unit}".strip() for v in (value, low, high))
-            notes.append(
-                f"Check: the {name} is {shown}, but {least} to {most} is usual in tests; "
-                "check the units (mm or Mm, mN or MN)."
-            )
+            said = f"the {name} is {shown}, but {least} to {most} is usual in tests"
+            notes.append(f"Check: {said}; check the units (mm or Mm, mN or MN).")
     for node, values in record.interior.items():
         name, largest = interior_channel(node), float(values.max())
         if largest >= height:
@@ -391,11 +385,9 @@ def count_rows(record: Record, outliers: dict[str, Outliers], block: int) -> Row
     """Count the rows of the file that are used, and those dropped with the reasons."""
     dropped, used = list(record.dropped), np.ones(len(record), dtype=bool)
     of_blocks = {c: np.repeat(o.left_out, block)[: len(record)] for c, o in outliers.items()}
-    reasons = {
-        f"a spike or gap of the {name}, bridged by a straight line": excess != 0.0
-        for name, excess in record.excess.items()
-    }
-    reasons["the displacement stands still, bridged by a straight line"] = record.stood_still
+    line, excess = "bridged by a straight line", record.excess
+    reasons = {f"a spike or gap of the {c}, {line}": spikes != 0.0 for c, spikes in excess.items()}
+    reasons[f"the displacement stands still, {line}"] = record.stood_still
     if record.clipped is not None:
         reasons["the force is clipped"] = of_blocks["stress"] & record.clipped
     for name, left_out in of_blocks.items():

@@ -188,11 +188,9 @@ def without_drift(record: Record, start: Start, levels: Levels) -> Record:
         return record
     rest = np.r_[:n, end : len(stress)]
     slope = level_on_line(time[rest], stress[rest], start.time, noise)[1]
-    record = record.noted(
-        f"The stress drifts by {engineering(slope.value * apart, 'Pa')} from before contact to "
-        "after it; this line is taken off."
-    )
-    return record.changed("stress", stress - slope.value * (time - start.time))
+    by = engineering(slope.value * apart, "Pa")
+    note = f"The stress drifts by {by} from before contact to after it; this line is taken off."
+    return record.noted(note).changed("stress", stress - slope.value * (time - start.time))
 
 
 def _zero_at_rest(
@@ -320,10 +318,8 @@ def flight_of(
         flight = (float(speed), float(error)) if speed > 0.5 * given else None
         deviation, error = abs(speed - given), float(np.hypot(error, spread))
         if deviation > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:
-            notes.append(
-                f"Check: before contact the displacement moves at {speed:.4g} ± {error:.2g} m/s, "
-                f"{CONTRADICTED} {given:.4g} m/s."
-            )
+            moves = f"the displacement moves at {speed:.4g} ± {error:.2g} m/s"
+            notes.append(f"Check: before contact {moves}, {CONTRADICTED} {given:.4g} m/s.")
     if striker.gravity is None and share > _MATTERS:
         notes.append(
             f"Check: a falling striker gains {gain} of its velocity over the contact, but the "

@@ -198,9 +198,9 @@ def turn_negative(parts: list[Channels], window: Window) -> tuple[str, ...]:
         )
     for channel in wrong:
         if stated := owners[channel].source.stated_sign(channel):
+            out = f"leave {stated} out in [{owners[channel].section}]"
             raise InputError(
-                f"the {channel} is negative in compression; it must be positive: leave {stated} "
-                f"out in [{owners[channel].section}]."
+                f"the {channel} is negative in compression; it must be positive: {out}."
             )
         owners[channel].turn(channel)
     return tuple(wrong)

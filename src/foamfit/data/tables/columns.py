@@ -76,10 +76,8 @@ class Source:
             own = [c for c in self.columns if c in _MOTIONS or interior_node(c)]
             if own:
                 header = table.headers[self.columns[own[0]]].text
-                raise InputError(
-                    f"column {header!r} is a {own[0]}, but [motion] file = {motion.file.name!r} "
-                    "contains the motion; leave one of them out."
-                )
+                wrong = f"column {header!r} is a {own[0]}, but [motion] file = {motion.file.name!r}"
+                raise InputError(f"{wrong} contains the motion; leave one of them out.")
             if "time" not in has:
                 wrong = f"no column is a time (there are {table.listed})"
                 raise InputError(f"{wrong}; with [motion] it needs one like 'time (ms)'.")
@@ -215,10 +213,8 @@ def _assigned(
         if unclear is None:
             both = " and ".join(map(table.name, best))
             entry = Entry(channel, column_of(table, best[0]))
-            raise InputError(
-                f"columns {both} could both be the {channel}; keep one, or write {entry} in "
-                "[columns]."
-            )
+            remedy = f"keep one, or write {entry} in [columns]"
+            raise InputError(f"columns {both} could both be the {channel}; {remedy}.")
         unclear[channel] = best
     # A channel given in the TOML takes precedence over a twin found by its header.
     for named, twin in TWINS.items():
@@ -300,10 +296,8 @@ def si_factor(table: Table, channel: str, k: int, given: Entry | None) -> float:
             over, _, under = given.scale_unit.rpartition("/")
             usual = under if in_si(channel, under) is None else over  # of N/mV or mV/N
         entry = replace(given, column=column_of(table, k), unit=usual)
-        raise InputError(
-            f"{where} has no unit; write it in the header like '{right}' or in [columns] like "
-            f"{entry}."
-        )
+        remedy = f"write it in the header like '{right}' or in [columns] like {entry}"
+        raise InputError(f"{where} has no unit; {remedy}.")
     unit = unit or ""
     if not is_unit(unit, any_case=True):
         raise InputError(f"{where} has an unknown unit {unit!r}; write it like '{right}'.")
