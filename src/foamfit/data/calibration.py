@@ -189,14 +189,11 @@ def with_gravity(test: Measurement) -> Measurement:
     falls, flies = (abs(value - one) <= AGREES * error for one in (GRAVITY, 0.0))
     if falls == flies or 2.0 * AGREES * error > GRAVITY:
         return test
-    note = (
-        f"Force and motion show that the striker {'falls' if falls else 'does not fall'}: gravity "
-        f"accelerates it by {value:.2g} ± {error:.1g} m/s². The fit takes "
-        f"{GRAVITY if falls else 0:g} m/s²."
-    )
+    does, taken = ("falls", GRAVITY) if falls else ("does not fall", 0.0)
+    note = f"Force and motion show that the striker {does}: gravity accelerates it by "
+    note += f"{value:.2g} ± {error:.1g} m/s². The fit takes {taken:g} m/s²."
     notes = tuple(note if one in asked else one for one in test.notes)
-    striker = replace(striker, gravity=GRAVITY if falls else 0.0)
-    return replace(test, striker=striker, notes=notes)
+    return replace(test, striker=replace(striker, gravity=taken), notes=notes)
 
 
 def _fitted(

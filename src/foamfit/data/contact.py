@@ -132,13 +132,9 @@ def _onset(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
 
 
 def leave_rest(
-    time: Array,
-    values: Array,
-    noise: NoiseLevel,
-    still: float = STILL,
-    drift: float = np.inf,
-    wanders: float = np.inf,
-) -> Kink | None:
+    time: Array, values: Array, noise: NoiseLevel,
+    still: float = STILL, drift: float = np.inf, wanders: float = np.inf,
+) -> Kink | None:  # fmt: skip
     """Find where a signal leaves its rest; None if there is no rest before the rise.
 
     A line is extrapolated back from the first part of the rise. At rest the slope, plus two

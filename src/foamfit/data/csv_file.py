@@ -56,12 +56,9 @@ def _with_cycles(window: Window, cycle: int | None, cycles: tuple[int, int] | No
 
 
 def read_test(
-    path: str | Path,
-    specimen: str | Path | None = None,
-    cycle: int | None = None,
-    *,
+    path: str | Path, specimen: str | Path | None = None, cycle: int | None = None, *,
     cycles: tuple[int, int] | None = None,
-) -> Measurement:
+) -> Measurement:  # fmt: skip
     """Read and check a test file and its TOML, and prepare the data for a fit.
 
     Parameters

@@ -64,10 +64,8 @@ class EnergyAudit:
         """Return a sentence if the loop gives out energy."""
         if self.dissipated_fraction is None or self.dissipated_fraction >= -0.02:
             return []
-        return [
-            "Check: the loop gives out more energy than it takes up; either the record runs "
-            "backwards, or force and motion are swapped."
-        ]
+        why = "either the record runs backwards, or force and motion are swapped"
+        return [f"Check: the loop gives out more energy than it takes up; {why}."]
 
     def sentences(self) -> list[str]:
         """Return the results, the warnings and the missing quantities, one sentence each."""

@@ -50,18 +50,13 @@ _USUAL = {
     "modulus (peak stress over peak strain)": (10.0, 1e11, "Pa"),
     "duration": (1e-6, 1e7, "s"),
 }
+_WHOLE, _UNKNOWN = Window(), Noise()  # the whole file; no noise is stated
 
 
 def condition(
-    record: Record,
-    specimen: Specimen,
-    *,
-    striker: Striker | None = None,
-    window: Window | None = None,
-    spread: float = 0.0,
-    stated: Noise | None = None,
-    late: bool = False,
-) -> Measurement:
+    record: Record, specimen: Specimen, *, striker: Striker | None = None,
+    window: Window = _WHOLE, spread: float = 0.0, stated: Noise = _UNKNOWN, late: bool = False,
+) -> Measurement:  # fmt: skip
     """Reduce all samples of a file to one loading and unloading; the test has no name yet.
 
     A record with a striker and a time is an impact, any other a slow test. Channels are positive
@@ -70,8 +65,7 @@ def condition(
     is estimated from samples before contact or from those of a held channel, or that of the samples
     is `stated`. A motion that may be `late` does not show the contact.
     """
-    window, given = window or Window(), striker or Striker()
-    impact = striker is not None and record.time is not None
+    given, impact = striker or Striker(), striker is not None and record.time is not None
     if impact and window.cycle not in (None, 1):
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
     record = repair.cut_strays(cut_to_window(record, window))
@@ -108,11 +102,9 @@ def condition(
         record = cut_to_contact(record, start, span)
     record = zeros.mark_flight(record, start, span, levels) if impact else record
     record = integrate_motion(record, specimen, given)
-    if impact:
-        record = start_within_height(record, specimen, given)
-    else:
-        record = replace(record, acceleration=None)
-    whole = checks(record, specimen, given, several=used.last is not None)
+    record = start_within_height(record, specimen, given) if impact else record
+    record = record if impact else replace(record, acceleration=None)
+    whole = checks(record, specimen, several=used.last is not None)
     whole, block = blocks.without_holds(whole, impact=impact)
     record = blocks.thin(whole, block)
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
@@ -122,7 +114,7 @@ def condition(
         noise["displacement"] = noise_of_integral(whole.instants, velocity)
     test = _measured(
         whole, record, block, excess, specimen=specimen, striker=striker and given, flight=flight,
-        noise=replace(_stated_of_blocks(stated or Noise(), levels, whole, block), estimated=noise),
+        noise=replace(_stated_of_blocks(stated, levels, whole, block), estimated=noise),
         contact="stress" if used.place else start.by, cycle=used.number, last_cycle=used.last,
         cycles=tuple(cycle.number for cycle in found) or (1,),
         rise=rise and _on_clock(rise, whole, block, 0 if used.place else span.first),
@@ -326,9 +318,7 @@ def start_within_height(record: Record, specimen: Specimen, striker: Striker) ->
     return record.noted(f"{done}, so that the displacement does not exceed the height.")
 
 
-def checks(
-    record: Record, specimen: Specimen, striker: Striker, *, several: bool = False
-) -> Record:
+def checks(record: Record, specimen: Specimen, *, several: bool) -> Record:
     """Reject strains beyond one, note implausible data (no reversals of `several` cycles)."""
     displacement, height = record.curves()["displacement"], specimen.height
     notes, motion = list[str](), record.motion

@@ -209,10 +209,9 @@ def _zero_at_rest(
     if zero.value:
         ratio = f", {abs(zero.value) / scatter:.2g} times that" if scatter > 0 else ""
         value, sigma, error = (engineering(v, unit) for v in (zero.value, scatter, zero.error))
-        note += (
-            f"The {name} before contact, {value}, is taken off as the sensor's offset ({n} samples "
-            f"at rest with a standard deviation of {sigma}{ratio}; standard error {error})."
-        )
+        how = f"{n} samples at rest with a standard deviation of {sigma}{ratio}"
+        note += f"The {name} before contact, {value}, is taken off as the sensor's offset ({how}; "
+        note += f"standard error {error})."
     return zero, note.strip()
 
 

@@ -58,13 +58,6 @@ class Channels:
     section: str = "columns"
     delay: float = 0.0
 
-    def turn(self, channel: str) -> None:
-        """Reverse the sign of a channel, with a note."""
-        values, name = self.numbers[channel], self.source.name(channel)
-        down = "counts down" if values.min() >= 0.0 else "is negative"
-        self.numbers[channel] = -values
-        self.notes.append(f"The {channel} {name} {down} in compression; its sign is reversed.")
-
     def engineering(self) -> dict[str, Array]:
         """Convert a strain of another measure to engineering strain, with a note."""
         for channel, values in self.numbers.items():
@@ -197,12 +190,14 @@ def turn_negative(parts: list[Channels], window: Window) -> tuple[str, ...]:
             f"not show which of them is negative in compression: write {' or '.join(entries)}."
         )
     for channel in wrong:
-        if stated := owners[channel].source.stated_sign(channel):
-            out = f"leave {stated} out in [{owners[channel].section}]"
-            raise InputError(
-                f"the {channel} is negative in compression; it must be positive: {out}."
-            )
-        owners[channel].turn(channel)
+        part = owners[channel]
+        if stated := part.source.stated_sign(channel):
+            remedy = f"it must be positive: leave {stated} out in [{part.section}]"
+            raise InputError(f"the {channel} is negative in compression; {remedy}.")
+        what = "counts down" if part.numbers[channel].min() >= 0.0 else "is negative"
+        what = f"The {channel} {part.source.name(channel)} {what} in compression"
+        part.notes.append(f"{what}; its sign is reversed.")
+        part.numbers[channel] = -part.numbers[channel]
     return tuple(wrong)
 
 

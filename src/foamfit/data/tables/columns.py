@@ -111,10 +111,9 @@ class Source:
         """Return the error for a file without any of the `wanted` channels."""
         entry = "force" if "force" in wanted else wanted[0]
         entries = entries_of(self.table, set(self.columns), entry, *others)
-        return InputError(
-            f"no column is a {' or a '.join(wanted)} (there are {self.table.listed}); name one "
-            f"like '{example(wanted[0])}', or write {entries} in [columns]{more}."
-        )
+        wrong = f"no column is a {' or a '.join(wanted)} (there are {self.table.listed})"
+        remedy = f"name one like '{example(wanted[0])}', or write {entries} in [columns]{more}"
+        return InputError(f"{wrong}; {remedy}.")
 
     def left_out(self) -> dict[str, int]:
         """Return unused columns that duplicate a channel: its twin, or another time."""
