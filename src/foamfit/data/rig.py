@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data import toml_file as toml
 from foamfit.data.cycles import loading_rate
 from foamfit.data.measurement import (
     MEASURED,
@@ -22,18 +23,6 @@ from foamfit.data.measurement import (
     interior_channel,
 )
 from foamfit.data.noise import with_noise
-from foamfit.data.toml_file import (
-    COUNT,
-    FLAG,
-    Check,
-    Quantity,
-    Several,
-    Span,
-    Table,
-    check_keys,
-    checked_tables,
-    load_toml,
-)
 from foamfit.errors import InputError, naming
 from foamfit.text import engineering, listed
 
@@ -44,7 +33,7 @@ Range = tuple[float, float]
 class Strain:
     """Check of a strain, or of a range of strains, between 0 and 1."""
 
-    positive: Quantity
+    positive: toml.Quantity
 
     def __call__(self, value: Any, where: str) -> Any:
         """Return the strain, or the ends of the range."""
@@ -55,29 +44,26 @@ class Strain:
         return found
 
 
-_RIG: dict[str, dict[str, Check]] = {
+_RIG: dict[str, dict[str, toml.Check]] = {
     "striker": {
-        "velocity": Span("m/s", "0.5 to 6 m/s"),
-        "masses": Several(Quantity("kg", "7 g"), 'like ["7 g", "14 g"]'),
+        "velocity": toml.Span("m/s", "0.5 to 6 m/s"),
+        "masses": toml.Several(toml.Quantity("kg", "7 g"), 'like ["7 g", "14 g"]'),
     },
     "machine": {
-        "rate": Span("1/s", "0.01 to 10 1/s"),
-        "strain": Strain(Span("", "0.1 to 0.7")),
-        "cycles": COUNT,
-        "hold": Quantity("s", "10 s"),
+        "rate": toml.Span("1/s", "0.01 to 10 1/s"),
+        "strain": Strain(toml.Span("", "0.1 to 0.7")),
+        "cycles": toml.COUNT,
+        "hold": toml.Quantity("s", "10 s"),
     },
     "limits": {
-        "force": Quantity("N", "500 N"),
-        "displacement": Quantity("m", "1 mm"),
-        "strain": Strain(Quantity("", "0.9")),
+        "force": toml.Quantity("N", "500 N"),
+        "displacement": toml.Quantity("m", "1 mm"),
+        "strain": Strain(toml.Quantity("", "0.9")),
     },
     "record": {
-        "rate": Quantity("1/s", "1 MHz"),
-        "noise": Table(
-            {"stress": Quantity("Pa", "20 kPa"), "displacement": Quantity("m", "2 um")},
-            '{ stress = "20 kPa" }',
-        ),
-        "interior": FLAG,
+        "rate": toml.Quantity("1/s", "1 MHz"),
+        "noise": toml.Table(toml.NOISE, '{ stress = "20 kPa" }'),
+        "interior": toml.FLAG,
     },
 }
 VELOCITIES, STRAINS, RATES = 24, 5, 5  # numbers of candidates over each range
@@ -271,10 +257,11 @@ def read_rig(path: Path | None, test: Measurement, *, relaxing: bool = False) ->
     """
     if path is None:
         return _completed({name: {} for name in _RIG}, test, relaxing)
-    document = load_toml(path, "a rig is a TOML with [striker], [limits], …; foamfit init --rig")
+    right = "a rig is a TOML with [striker], [limits], …; foamfit init --rig"
+    document = toml.load_toml(path, right)
     with naming(path):
-        check_keys("a rig", document, _RIG)
-        return _completed(checked_tables(document, _RIG), test, relaxing)
+        toml.check_keys("a rig", document, _RIG)
+        return _completed(toml.checked_tables(document, _RIG), test, relaxing)
 
 
 def _completed(stated: dict[str, dict[str, Any]], test: Measurement, relaxing: bool) -> Rig:

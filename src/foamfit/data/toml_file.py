@@ -24,14 +24,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from foamfit.data import units
 from foamfit.data.measurement import GRAVITY, Entry, Noise, Specimen, Striker, Window, interior_node
-from foamfit.data.units import (
-    is_unit,
-    parse_quantity,
-    parse_uncertain,
-    split_quantity,
-    split_uncertain,
-)
 from foamfit.errors import InputError, naming
 from foamfit.files import read_whole
 from foamfit.terminal import printable
@@ -77,9 +71,9 @@ class Quantity:
         """Return the quantity in SI."""
         given, sigma = (value, self.si, where, self.example), None
         if self.uncertain:
-            number, sigma = parse_uncertain(*given, zero=not self.positive)
+            number, sigma = units.parse_uncertain(*given, zero=not self.positive)
         else:
-            number = parse_quantity(*given)
+            number = units.parse_quantity(*given)
         if self.positive and number <= 0.0:
             raise InputError(f'{where} = "{value}" must be positive, like "{self.example}".')
         return Stated(number, sigma) if self.uncertain else number
@@ -91,10 +85,10 @@ class Span(Quantity):
     def __call__(self, value: Any, where: str) -> tuple[float, float]:
         """Return the ends in SI, in ascending order."""
         ends = value.split(" to ") if isinstance(value, str) else [value]
-        first, last = (split_quantity(str(ends[i])) for i in (0, -1))
+        first, last = (units.split_quantity(str(ends[i])) for i in (0, -1))
         if len(ends) == 2 and first and last and not first[1]:
             ends[0] = f"{ends[0]} {last[1]}"
-        found = [parse_quantity(end, self.si, where, self.example) for end in ends]
+        found = [units.parse_quantity(end, self.si, where, self.example) for end in ends]
         if len(found) > 2 or found[0] <= 0.0 or found != sorted(found):
             wanted = f'a range of positive values, like "{self.example}"'
             raise InputError(f'{where} = "{value}" must be {wanted}.')
@@ -214,6 +208,10 @@ def checked(
 _FILE = Rule(
     lambda v: isinstance(v, str) and v.strip() != "" and "\0" not in v, 'a file, like "camera.csv"'
 )
+NOISE: dict[str, Check] = {
+    "stress": Quantity("Pa", "20 kPa"),
+    "displacement": Quantity("m", "2 um"),
+}
 _stated = partial(Quantity, uncertain=True)
 _SECTIONS: dict[str, dict[str, Check]] = {
     "specimen": {
@@ -228,7 +226,7 @@ _SECTIONS: dict[str, dict[str, Check]] = {
         "velocity": _stated("m/s", "1.75 m/s"),
         "gravity": FLAG,
     },
-    "noise": {"stress": Quantity("Pa", "20 kPa"), "displacement": Quantity("m", "2 um")},
+    "noise": NOISE,
     "window": {
         "start": Quantity("s", "0.5 ms", positive=False),
         "end": Quantity("s", "2 ms", positive=False),
@@ -370,10 +368,10 @@ def _motion(path: Path, values: dict[str, Any]) -> Motion:
 def _scale(value: Any, where: str) -> tuple[float, str, float | None]:
     """Return number, unit and standard deviation of a scale, such as "4444.4 ± 5 N/V"."""
     text = str(value)
-    parts = split_quantity(split_uncertain(text)[0])
-    if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not is_unit(parts[1]):
+    parts = units.split_quantity(units.split_uncertain(text)[0])
+    if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not units.is_unit(parts[1]):
         raise InputError(f'{where} = {value!r} must be like -1 or "{_SCALE}".')
-    return *parts, parse_uncertain(text, parts[1], where, _SCALE)[1]
+    return *parts, units.parse_uncertain(text, parts[1], where, _SCALE)[1]
 
 
 _COLUMN: dict[str, Check] = {
@@ -381,7 +379,9 @@ _COLUMN: dict[str, Check] = {
         lambda v: isinstance(v, str) or (type(v) is int and v > 0),
         'a header or a number, like column = "Load" or column = 2',
     ),
-    "unit": Rule(lambda v: isinstance(v, str) and is_unit(v), 'a known unit, like unit = "mm"'),
+    "unit": Rule(
+        lambda v: isinstance(v, str) and units.is_unit(v), 'a known unit, like unit = "mm"'
+    ),
     "scale": _scale,
     "counts_down": FLAG,
 }
@@ -400,7 +400,7 @@ def _columns(
         found = Table(keys, right, ("column",))(entry, where)
         number, unit, sigma = found.pop("scale", (1.0, "", None))
         if sigma is not None and (inside or channel in ("time", "cycle")):
-            parse_quantity(entry["scale"], unit, f"{where}: scale", _SCALE)  # refuses the ±
+            units.parse_quantity(entry["scale"], unit, f"{where}: scale", _SCALE)  # refuses the ±
         spread = (sigma or 0.0) / abs(number)
         columns[channel] = Entry(channel, **found, scale=number, scale_unit=unit, spread=spread)
     return columns
