@@ -169,10 +169,8 @@ def balance(test: Measurement) -> Balance:
     damped = _fitted(*given, damped=True)
     if damped is None or damped.damping is None or contradictions(test, damped):
         return plain
-    if not contradictions(test, fitted) and damped.scatter > 0.5 * fitted.scatter:
-        return plain
-    size, error = damped.damping
-    if size <= BEYOND * error:
+    (size, error), closer = damped.damping, damped.scatter <= 0.5 * fitted.scatter
+    if size <= BEYOND * error or not (closer or contradictions(test, fitted)):
         return plain
     return damped if velocity is not None else Balance(None, damped.force, None, damped.damping)
 

@@ -280,8 +280,8 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
     start = _at_kink("stress", time, at, "stress") if at else None
     if w is None:
         return start or _at_first(time)
-    top, onset = int(np.argmax(w)), start.first if start else 0
-    if start and float(w[onset]) - first > _APPROACH * float(w[top] - w[onset]):
+    top = int(np.argmax(w))
+    if start and w[start.first] - first > _APPROACH * float(w[top] - w[start.first]):
         return replace(start, gauge="flight")
     up, noise = slice(top + 1), levels["displacement"]
     if at := leave_rest(time[up], w[up], noise, wanders=_MOTION_WANDERS):

@@ -135,16 +135,13 @@ class Candidate:
         """Return times (s) and displacements (m) of a slow test of a specimen."""
         assert self.strain is not None
         assert self.rate is not None
-        ramp = self.strain / self.rate
-        held = bool(self.hold)
-        lasts = [ramp, *[self.hold] * held, ramp] * self.cycles
+        ramp, top, rows = self.strain / self.rate, self.strain, CYCLE_SAMPLES // 2
+        hold = [(self.hold, top)] if self.hold else []
+        lasts, levels = zip(*[(ramp, top), *hold, (ramp, 0.0)] * self.cycles, strict=True)
         corners = [0.0, *accumulate(lasts)]
-        levels = [0.0, *([self.strain, *[self.strain] * held, 0.0] * self.cycles)]
-        parts = [
-            np.linspace(*ends, CYCLE_SAMPLES // 2, endpoint=False) for ends in pairwise(corners)
-        ]
+        parts = [np.linspace(*ends, rows, endpoint=False) for ends in pairwise(corners)]
         time = np.append(np.concatenate(parts), corners[-1])
-        return time, height * np.interp(time, corners, levels)
+        return time, height * np.interp(time, corners, [0.0, *levels])
 
     def recorded(
         self, test: Measurement, rig: Rig, lasts: float, peak: float, *, with_motion: bool = False
@@ -168,10 +165,8 @@ class Candidate:
                 spreads["velocity"] *= self.velocity / was
         else:
             time, moved = self.motion(height)
-        levels = {
-            channel: NoiseLevel(sigma, getattr(known, channel) is not None, "the rig")
-            for channel, sigma in rig.noise.items()
-        }
+        given = {c: c in known.levels for c in rig.noise}
+        levels = {c: NoiseLevel(sigma, given[c], "the rig") for c, sigma in rig.noise.items()}
         seen = {*test.interior, *filter(None, [self.interior])}
         ramp = np.linspace(0.0, 1.0, time.size)
         levels |= {interior_channel(node): levels["displacement"] for node in seen}
@@ -198,10 +193,8 @@ class Candidate:
         height, area = test.specimen.height * 1e3, test.specimen.area * 1e6
         lines = [
             f"# {self}: advised by foamfit plan. Put this beside the record, with the same name.",
-            "[specimen]",
-            f'height = "{height:.6g} mm"',
-            f'area = "{area:.6g} mm^2"',
-        ]
+            "[specimen]", f'height = "{height:.6g} mm"', f'area = "{area:.6g} mm^2"',
+        ]  # fmt: skip
         if test.specimen.mass is not None:
             lines.append(f'mass = "{test.specimen.mass * 1e6:.6g} mg"')
         if test.specimen.heights is not None:
@@ -218,7 +211,7 @@ class Candidate:
         if self.interior:
             name = interior_channel(self.interior)
             lines.append(f"# Record the displacement of interior mass {self.interior} as {name}.")
-        return "\n".join(lines) + "\n"
+        return "\n".join([*lines, ""])
 
 
 def candidates(rig: Rig, test: Measurement, springs: int) -> list[Candidate]:
