@@ -180,10 +180,9 @@ def _record(channels: Channels, settings: Settings) -> Record:
     notes += _compare(channels.source, numbers, settings)
     specimen, striker = settings.specimen, settings.striker or Striker()
     if settings.striker is not None and "time" not in numbers:
-        notes.append(
-            "Check: there is a [striker] but no time column, so this is treated as a slow test "
-            "and the striker is not used; name the time in [columns]."
-        )
+        slow = "this is treated as a slow test and the striker is not used"
+        said = f"there is a [striker] but no time column, so {slow}"
+        notes.append(f"Check: {said}; name the time in [columns].")
     stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
     displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
     acceleration = numbers.get("acceleration")

@@ -101,8 +101,7 @@ class Outliers:
     """Samples of a channel that are `left_out` of the fit (n,): spikes, short gaps, clipped force.
 
     Spikes and gaps are replaced by a straight line. Their original `values` (k,), Pa or m, belong
-    to the times `at` (k,), s, or sample numbers. The force is clipped at the stress `clipped_at`,
-    Pa.
+    to the times `at` (k,), s, or sample numbers. The force is clipped at `clipped_at`, Pa.
     """
 
     left_out: Mask

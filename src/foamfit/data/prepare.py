@@ -365,10 +365,9 @@ def checks(record: Record, specimen: Specimen, *, several: bool) -> Record:
 
 def _never_positive(stress: Array) -> InputError:
     least, most = (engineering(float(v) + 0.0, "Pa") for v in (stress.min(), stress.max()))
-    return InputError(
-        f"the stress is never positive in the part that is used, only {least} to {most}; correct "
-        "its zero in the file, or choose another part or cycle by [window]."
-    )
+    wrong = f"the stress is never positive in the part that is used, only {least} to {most}"
+    remedy = "correct its zero in the file, or choose another part or cycle by [window]"
+    return InputError(f"{wrong}; {remedy}.")
 
 
 def count_rows(record: Record, outliers: dict[str, Outliers], block: int) -> RowCount:

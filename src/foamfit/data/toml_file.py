@@ -286,7 +286,8 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
     and the invalid or missing key.
     """
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
-    check_keys(f"{path}:", document, ["name", "columns", "priors", *_SECTIONS])
+    tables = dict.fromkeys(["columns", "motion", "priors", *_SECTIONS])
+    check_keys(f"{path}:", document, ["name", *tables])
     with naming(path):
         values, spreads = _split(checked_tables(document, _SECTIONS))
         window, striker, priors = values["window"], values["striker"], table_of(document, "priors")

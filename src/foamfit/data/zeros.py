@@ -320,10 +320,9 @@ def flight_of(
             moves = f"the displacement moves at {speed:.4g} ± {error:.2g} m/s"
             notes.append(f"Check: before contact {moves}, {CONTRADICTED} {given:.4g} m/s.")
     if striker.gravity is None and share > _MATTERS:
-        notes.append(
-            f"Check: a falling striker gains {gain} of its velocity over the contact, but the "
-            f"record {UNKNOWN_FALL}; write gravity = true or false under [striker]."
-        )
+        remedy = "write gravity = true or false under [striker]"
+        gains = f"a falling striker gains {gain} of its velocity over the contact"
+        notes.append(f"Check: {gains}, but the record {UNKNOWN_FALL}; {remedy}.")
     return striker, flight, notes
 
 

@@ -230,7 +230,15 @@ def _best(table: Table, channel: str, ranks: dict[int, int]) -> list[int]:
     best = [k for k, rank in ranks.items() if rank == min(ranks.values())]
     names = {k: table.headers[k] for k in best}  # "stress" is better than "reference stress"
     best = [k for k in best if not any(names[k].qualifies(names[other]) for other in best)]
-    return _clear_time(table, best) if len(best) > 1 and channel == "time" else best
+    if len(best) < 2 or channel != "time":
+        return best
+    try:  # the only time column that never decreases, if any
+        numbers = read_numbers(table, {str(k): k for k in best})[0]
+    except InputError:  # for example tests of different lengths side by side
+        return best
+    steps = {k: np.diff(numbers[str(k)]) for k in best}
+    rising = [k for k, step in steps.items() if step.size and step.min() >= 0.0 < step.max()]
+    return rising if len(rising) == 1 else best
 
 
 def _channels(table: Table, given: dict[str, Entry]) -> list[str]:
@@ -260,17 +268,6 @@ def column_of(table: Table, k: int) -> str | int:
     text = table.headers[k].text
     unique = table.header_row and [h.text for h in table.headers].count(text) == 1
     return text if unique else k + 1
-
-
-def _clear_time(table: Table, columns: list[int]) -> list[int]:
-    """Reduce several possible time columns to the only one that never decreases, if any."""
-    try:
-        numbers = read_numbers(table, {str(k): k for k in columns})[0]
-    except InputError:  # for example tests of different lengths side by side
-        return columns
-    steps = {k: np.diff(numbers[str(k)]) for k in columns}
-    rising = [k for k, step in steps.items() if step.size and step.min() >= 0.0 < step.max()]
-    return rising if len(rising) == 1 else columns
 
 
 def si_factor(table: Table, channel: str, k: int, given: Entry | None) -> float:
