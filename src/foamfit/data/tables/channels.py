@@ -107,11 +107,9 @@ def engineering_strain(measure: str, strain: Array) -> Array:
     if measure == "logarithmic":
         return 1.0 - np.exp(-strain)
     if measure and strain.max() >= 0.5:
-        wrong = (
-            f"the {measure} strain reaches {strain.max():.3g}; in compression it stays below 0.5"
-        )
         raise InputError(
-            f"{wrong}, so the column must contain another strain or have another unit."
+            f"the {measure} strain reaches {strain.max():.3g}; in compression it stays below 0.5, "
+            "so the column must contain another strain or have another unit."
         )
     return 1.0 - np.sqrt(1.0 - 2.0 * strain) if measure else strain
 
