@@ -103,7 +103,8 @@ def read_test(
         turned = turn_negative(parts, window)
         record = _record(parts[0], settings)
     if motion is not None:
-        frames, notes = _frames(parts[1], motion.file.name, settings)
+        with naming(motion.file):
+            frames, notes = _frames(parts[1], motion.file.name, settings)
         with naming(toml):
             record = join(record.noted(*notes), frames)
     with naming(path):
