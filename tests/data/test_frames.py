@@ -222,6 +222,10 @@ def test_a_wrong_motion_is_refused(tmp_path, toml, words):
         ),
         ({"time (s)": np.negative, "displacement (mm)": press}, ["camera.csv: row 3", "goes back"]),
         (
+            {"time (s)": np.copy, "green strain (%)": lambda t: 1.5e4 * press(t)},
+            ["camera.csv: the Green–Lagrange strain reaches 0.6"],
+        ),
+        (
             {"time (s)": lambda t: t + 1.0, "displacement (mm)": press},
             ["test.toml: [motion] camera.csv does not overlap in time"],
         ),

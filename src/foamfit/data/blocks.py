@@ -1,13 +1,14 @@
-"""Means of blocks of rows, to which long records are reduced."""
+"""Means of blocks of rows, to which long records are reduced, and their noise."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from foamfit.arrays import Mask, means
-from foamfit.data import frames
-from foamfit.data.measurement import Record
-from foamfit.data.noise import noise_level, smooth
+from foamfit.data.measurement import NoiseLevel, Record
+from foamfit.data.noise import averaged, noise_level, smooth
 
 _MAX_ROWS = 1500  # more samples than this are averaged in blocks
 _BLOCKS = 1000  # number of these blocks, at most, unless a ramp would have too few
@@ -17,6 +18,7 @@ _LAG = _OF_RAMP // 10
 # Blocks move if means of _LAG of them differ by more than this share of the range, and by more than
 # this many standard deviations of noise.
 _MOVES, _BEYOND = 0.005, 6.0
+_SEVERAL = 2.0  # median number of measured rows in a block from which they are averaged
 
 
 def without_holds(record: Record, *, impact: bool = False) -> tuple[Record, int]:
@@ -63,14 +65,35 @@ def _moving(record: Record, block: int) -> Mask:
 
 
 def thin(record: Record, size: int) -> Record:
-    """Average a long record in blocks of some rows, which also reduces its noise."""
-    n = len(record)
+    """Average a long record in blocks of some rows, which also reduces its noise.
+
+    A channel that was not measured at every row is averaged if blocks have several measured rows.
+    Otherwise it is interpolated at the time of the block, because averages of an interpolated curve
+    would be biased.
+    """
     if size == 1:
         return record
-    edges = np.arange(0, n, size)
-    time = None if record.time is None else means(record.time, edges)
-    note = f"{n} samples are averaged in {len(edges)} blocks of {size}."
+    edges = np.arange(0, len(record), size)
+    middle = means(record.instants, edges)
+    note = f"{len(record)} samples are averaged in {len(edges)} blocks of {size}."
+    time = None if record.time is None else middle
     thinned = Record(time, record.stress, None, notes=(*record.notes, note))
     for name, values in record.curves("acceleration").items():
-        thinned = thinned.changed(name, means(values, edges))
-    return frames.frames_of_blocks(record, thinned, edges)
+        mean, taken = means(values, edges), record.sampled.get(name)
+        if taken is not None:
+            count = np.add.reduceat(taken.astype(np.int64), edges)
+            several = (usual := float(np.median(count))) >= _SEVERAL
+            mean = mean if several else np.interp(middle, record.instants, values)
+            measured = count >= 0.5 * usual if several else count > 0
+            if not several or not measured.all():
+                thinned = replace(thinned, sampled=thinned.sampled | {name: measured})
+        thinned = thinned.changed(name, mean)
+    return thinned
+
+
+def noise_of_blocks(level: NoiseLevel, block: int, taken: Mask | None) -> NoiseLevel:
+    """Return the noise of blocks of samples if only those `taken` were measured."""
+    edges = np.arange(0, 0 if taken is None else taken.size, block)
+    if taken is None or np.median(np.add.reduceat(taken.astype(np.int64), edges)) >= _SEVERAL:
+        return averaged(level, block)
+    return replace(level, time=max(level.time * float(taken.mean()), 1.0))

@@ -11,7 +11,7 @@ assumed where it alone makes all numbers agree.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,23 +59,15 @@ class Balance:
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A number that the record contradicts.
+    """A number that the record contradicts; a clause `says` what contradicts what.
 
-    Attributes
-    ----------
-    quantity
-        "velocity", "force_scale", "motion_scale" or "time_shift".
-    ratio, limit
-        Number that the record shows over the number in use, and the largest difference of this
-        ratio from 1 of numbers that agree. Of a time shift, the delay of the motion against the
-        force, s, and the largest one that may be noise of the record.
-    says
-        What contradicts what, a clause.
-    lines
-        Tables and lines of the TOML, each of which would settle it, the likelier one first.
+    `ratio` is the number that the record shows over the number in use, `limit` the largest
+    difference of this ratio from 1 of numbers that agree. Of a time shift, they are the delay of
+    the motion against the force, s, and the largest one that may be noise of the record. `lines`
+    are tables and lines of the TOML, each of which would settle it, the likelier one first.
     """
 
-    quantity: str
+    quantity: str  #: "velocity", "force_scale", "motion_scale" or "time_shift"
     ratio: float
     limit: float
     says: str
@@ -90,12 +82,17 @@ class Contradiction:
 
 
 def contradictions(test: Measurement, shown: Balance | None = None) -> tuple[Contradiction, ...]:
-    """Return the numbers that the record of an impact contradicts, the velocity first.
-
-    `shown` is its `balance`, if that is known.
-    """
+    """Return the numbers that a record contradicts, the velocity first; `shown`: its `balance`."""
     shown = balance(test) if shown is None else shown
-    return (*_of_striker(test, shown), *_of_delay(test, shown.delay))
+    found = _of_striker(test, shown)
+    if shown.delay is not None and test.time is not None:
+        (late, error), stated = shown.delay, test.uncertainties.get("delay", 0.0)
+        limit = max(LATE * error, float(np.median(np.diff(test.time))))
+        if abs(late) > max(limit, LATE * math.hypot(error, stated)):
+            says = f"the motion is {'late' if late > 0.0 else 'early'} against the force by "
+            says += f"{engineering(abs(late), 's')} ± {engineering(float(f'{error:.2g}'), 's')}"
+            found.append(Contradiction("time_shift", late, limit, says, ()))
+    return tuple(found)
 
 
 def _of_striker(test: Measurement, shown: Balance) -> list[Contradiction]:
@@ -118,7 +115,11 @@ def _of_striker(test: Measurement, shown: Balance) -> list[Contradiction]:
             found.append(_of_force(test, ratio, limit, striker.mass))
     # If the motion is too fast and too long by one factor, its scale alone may be wrong.
     if len(found) == 2 and abs(found[0].ratio / found[1].ratio - 1.0) < found[1].limit:
-        found = [_of_motion(test, found[1].ratio, found[1].limit)]
+        ratio, limit = found[1].ratio, found[1].limit
+        says = f"the motion is {ratio:.2f} times as large as mass, velocity and force imply"
+        entry = test.entries.get("displacement", Entry("displacement"))
+        lines = ((entry.table, entry.times(1.0 / ratio, TENTH * limit)),)
+        return [Contradiction("motion_scale", 1.0 / ratio, limit, says, lines)]
     return found
 
 
@@ -145,27 +146,6 @@ def _of_force(test: Measurement, ratio: float, limit: float, mass: float) -> Con
     return Contradiction("force_scale", ratio, limit, says, tuple(lines))
 
 
-def _of_motion(test: Measurement, ratio: float, limit: float) -> Contradiction:
-    """Return the contradiction between the scale of the motion and all else."""
-    says = f"the motion is {ratio:.2f} times as large as mass, velocity and force imply"
-    entry = test.entries.get("displacement", Entry("displacement"))
-    line = entry.table, entry.times(1.0 / ratio, TENTH * limit)
-    return Contradiction("motion_scale", 1.0 / ratio, limit, says, (line,))
-
-
-def _of_delay(test: Measurement, delay: Shown | None) -> Iterator[Contradiction]:
-    """Yield the contradiction between the clocks of force and motion, if they disagree."""
-    if delay is None or test.time is None:
-        return
-    late, stated = delay[0], test.uncertainties.get("delay", 0.0)
-    limit = max(LATE * delay[1], float(np.median(np.diff(test.time))))
-    if abs(late) > max(limit, LATE * math.hypot(delay[1], stated)):
-        says = f"the motion is {'late' if late > 0.0 else 'early'} against the force by "
-        error = float(f"{delay[1]:.2g}")
-        says += f"{engineering(abs(late), 's')} ± {engineering(error, 's')}"
-        yield Contradiction("time_shift", late, limit, says, ())
-
-
 def balance(test: Measurement) -> Balance:
     """Return what the equation of motion of the striker shows in an impact."""
     striker, w, stress, time = test.striker, test.displacement, test.stress, test.time
@@ -189,10 +169,8 @@ def balance(test: Measurement) -> Balance:
     damped = _fitted(*given, damped=True)
     if damped is None or damped.damping is None or contradictions(test, damped):
         return plain
-    if not contradictions(test, fitted) and damped.scatter > 0.5 * fitted.scatter:
-        return plain
-    size, error = damped.damping
-    if size <= BEYOND * error:
+    (size, error), closer = damped.damping, damped.scatter <= 0.5 * fitted.scatter
+    if size <= BEYOND * error or not (closer or contradictions(test, fitted)):
         return plain
     return damped if velocity is not None else Balance(None, damped.force, None, damped.damping)
 
@@ -209,14 +187,11 @@ def with_gravity(test: Measurement) -> Measurement:
     falls, flies = (abs(value - one) <= AGREES * error for one in (GRAVITY, 0.0))
     if falls == flies or 2.0 * AGREES * error > GRAVITY:
         return test
-    note = (
-        f"Force and motion show that the striker {'falls' if falls else 'does not fall'}: gravity "
-        f"accelerates it by {value:.2g} ± {error:.1g} m/s². The fit takes "
-        f"{GRAVITY if falls else 0:g} m/s²."
-    )
+    does, taken = ("falls", GRAVITY) if falls else ("does not fall", 0.0)
+    note = f"Force and motion show that the striker {does}: gravity accelerates it by "
+    note += f"{value:.2g} ± {error:.1g} m/s². The fit takes {taken:g} m/s²."
     notes = tuple(note if one in asked else one for one in test.notes)
-    striker = replace(striker, gravity=GRAVITY if falls else 0.0)
-    return replace(test, striker=striker, notes=notes)
+    return replace(test, striker=replace(striker, gravity=taken), notes=notes)
 
 
 def _fitted(

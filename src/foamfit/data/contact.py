@@ -132,13 +132,9 @@ def _onset(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
 
 
 def leave_rest(
-    time: Array,
-    values: Array,
-    noise: NoiseLevel,
-    still: float = STILL,
-    drift: float = np.inf,
-    wanders: float = np.inf,
-) -> Kink | None:
+    time: Array, values: Array, noise: NoiseLevel,
+    still: float = STILL, drift: float = np.inf, wanders: float = np.inf,
+) -> Kink | None:  # fmt: skip
     """Find where a signal leaves its rest; None if there is no rest before the rise.
 
     A line is extrapolated back from the first part of the rise. At rest the slope, plus two
@@ -207,9 +203,8 @@ def first_contact(record: Record) -> Record:
         before, after = (float(part.clip(0.0).sum()) for part in (share[:begin], share[begin:]))
         if share[:end].max() >= 0.5 and before >= 0.5 * after:
             why = "after the first contact, as the striker comes back"
-            return record.without(slice((end + begin) // 2, None), why).noted(
-                "The striker comes back after its rebound; only the first contact is used."
-            )
+            note = "The striker comes back after its rebound; only the first contact is used."
+            return record.without(slice((end + begin) // 2, None), why).noted(note)
     return record
 
 
@@ -250,8 +245,7 @@ def start_of_impact(record: Record, levels: Levels, *, late: bool = False) -> St
 
 def motion_leaves_rest(record: Record, levels: Levels) -> Kink | None:
     """Find where the motion of an impact leaves its rest; None if it has none."""
-    w = record.displacement
-    assert w is not None  # checked by the callers
+    w = record.curves()["displacement"]
     up = slice(int(np.argmax(w)) + 1)
     return leave_rest(record.instants[up], w[up], levels["displacement"], STILL_MOTION)
 
@@ -286,12 +280,11 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
     start = _at_kink("stress", time, at, "stress") if at else None
     if w is None:
         return start or _at_first(time)
-    top, onset = int(np.argmax(w)), start.first if start else 0
-    if start and float(w[onset]) - first > _APPROACH * float(w[top] - w[onset]):
+    top = int(np.argmax(w))
+    if start and w[start.first] - first > _APPROACH * float(w[top] - w[start.first]):
         return replace(start, gauge="flight")
-    if at := leave_rest(
-        time[: top + 1], w[: top + 1], levels["displacement"], wanders=_MOTION_WANDERS
-    ):
+    up, noise = slice(top + 1), levels["displacement"]
+    if at := leave_rest(time[up], w[up], noise, wanders=_MOTION_WANDERS):
         # Where a stress drives a foam with a dashpot, the motion follows it later.
         later = start and start.time + _LATER * float(np.hypot(start.error, at[1])) < at[0]
         if start and later and _has_risen(time, stress, start.first, at[0], levels["stress"]):
@@ -323,16 +316,9 @@ def rise_of(
     slope, a parabola and a cubic, none of them negative. The probability of each trial time follows
     from its sum of squares: a rise that begins softly leaves the contact open, a kink does not.
 
-    Parameters
-    ----------
-    time, values : (n,) array
-        s (or sample numbers) and the channel, positive in compression, zero taken off.
-    noise : NoiseLevel
-        Noise of the channel; the scatter at rest is used instead if it is larger.
-    rest : int
-        Number of rows before any contact.
-    zero : float, optional
-        Standard error of the zero; None if it was not measured.
+    Time, s (or sample numbers), and values, zero taken off, are of shape (n,). The first `rest`
+    rows are before any contact; their scatter is used if it is larger than the `noise`. `zero` is
+    the standard error of the zero, None if it was not measured.
     """
     top = int(np.argmax(values))
     up, sigma, tau = values[: top + 1], noise.sigma, noise.time
@@ -346,9 +332,8 @@ def rise_of(
     clear = _CLEAR * sigma * np.sqrt(min(tau / width, 1.0))
     level = min(max(_RISE_SHARE * size, clear), _LARGEST * size)
     part = _first_rise(smooth(up, width) - base, level)
-    if part.stop - part.start < _RISE_FEWEST:
+    if (rows := part.stop - part.start) < _RISE_FEWEST:
         return None
-    rows = part.stop - part.start
     block = max(1, rows // _ROWS)
     part = slice(part.stop - rows // block * block, part.stop)
     t, y = (x[part].reshape(-1, block).mean(axis=1) for x in (time, values))
@@ -376,8 +361,7 @@ def rise_of(
 def _first_rise(values: Array, level: float) -> slice:
     """Return the rows of the first rise up to a level, and enough before it to find its start."""
     high = _first_above(values, level)
-    below = np.flatnonzero(values[: high + 1] < _LOW * level)
-    low = int(below[-1]) if below.size else 0
+    low = max(np.flatnonzero(values[: high + 1] < _LOW * level), default=0)
     return slice(max(0, low - _BEFORE * max(high - low, 2) - _ROWS_BEFORE), high + 2)
 
 

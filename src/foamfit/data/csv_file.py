@@ -38,7 +38,7 @@ from foamfit.data.tables.columns import TWINS, Source, si_factor
 from foamfit.data.tables.csv_table import read_numbers, read_text
 from foamfit.data.tables.draft import without_toml
 from foamfit.data.tables.headers import CHANNELS, example
-from foamfit.data.toml_file import RANGE, Settings, read_settings, toml_beside
+from foamfit.data.toml_file import RANGE, Motion, Settings, read_settings, toml_beside
 from foamfit.errors import InputError, naming
 from foamfit.text import engineering, percent
 
@@ -56,12 +56,9 @@ def _with_cycles(window: Window, cycle: int | None, cycles: tuple[int, int] | No
 
 
 def read_test(
-    path: str | Path,
-    specimen: str | Path | None = None,
-    cycle: int | None = None,
-    *,
+    path: str | Path, specimen: str | Path | None = None, cycle: int | None = None, *,
     cycles: tuple[int, int] | None = None,
-) -> Measurement:
+) -> Measurement:  # fmt: skip
     """Read and check a test file and its TOML, and prepare the data for a fit.
 
     Parameters
@@ -98,27 +95,23 @@ def read_test(
     with naming(path):
         source = Source.of(text, settings.columns).needed(settings)
         parts = [read_channels(source, settings.duplicates)]
-    sha256 = text.sha256
-    if settings.motion is not None:
-        parts.append(_read_motion(path, toml, settings))
+    sha256, stated = text.sha256, settings.uncertainties
+    if (motion := settings.motion) is not None:
+        parts.append(_read_motion(path, toml, motion, settings.duplicates))
         sha256 = hashlib.sha256(f"{sha256} {parts[1].source.table.sha256}".encode()).hexdigest()
     with naming(path):
         turned = turn_negative(parts, window)
         record = _record(parts[0], settings)
-    if settings.motion is not None:
-        frames, notes = _frames(parts[1], settings)
+    if motion is not None:
+        with naming(motion.file):
+            frames, notes = _frames(parts[1], motion.file.name, settings)
         with naming(toml):
             record = join(record.noted(*notes), frames)
     with naming(path):
         test = condition(
-            record,
-            settings.specimen,
-            striker=settings.striker,
-            window=window,
-            spread=settings.uncertainties.get("velocity", 0.0),
-            stated=settings.noise,
-            late=bool(settings.uncertainties.get("delay")),
-        )
+            record, settings.specimen, striker=settings.striker, window=window,
+            spread=stated.get("velocity", 0.0), stated=settings.noise, late="delay" in stated,
+        )  # fmt: skip
     for channel, unit in (("stress", "Pa"), ("displacement", "m")):
         size, sigma = float(np.ptp(test.channels()[channel])), getattr(settings.noise, channel)
         if sigma is not None and sigma > size:
@@ -132,15 +125,9 @@ def read_test(
         spreads |= part.source.scale_spreads()
         entries |= part.source.entries(part.section)
     test = replace(
-        test,
-        name=settings.name,
-        path=path,
-        data_sha256=sha256,
-        uncertainties=spreads | settings.uncertainties,
-        turned=turned,
-        priors=settings.priors,
-        entries=entries,
-    )
+        test, name=settings.name, path=path, data_sha256=sha256, turned=turned,
+        uncertainties=spreads | stated, priors=settings.priors, entries=entries,
+    )  # fmt: skip
     return with_noise(test)
 
 
@@ -162,52 +149,46 @@ def read_history(path: Path, channel: str) -> tuple[Array, Array]:
     return numbers["time"], numbers[channel]
 
 
-def _read_motion(path: Path, toml: Path, settings: Settings) -> Channels:
-    """Read the channels of the file named in [motion]."""
-    motion = settings.motion
-    assert motion is not None  # checked by the caller
+def _read_motion(path: Path, toml: Path, motion: Motion, duplicates: str) -> Channels:
     if os.path.realpath(motion.file) == os.path.realpath(path):
-        raise InputError(
-            f"{toml}: [motion] file = {motion.file.name!r} is the file of the force; name one of "
-            "its own."
-        )
+        wrong = f"[motion] file = {motion.file.name!r} is the file of the force"
+        raise InputError(f"{toml}: {wrong}; name one of its own.")
     text = read_text(motion.file, f"in [motion] file of {toml.name} the CSV file of the motion")
     try:
         with naming(motion.file):
             source = Source.of(text, motion.columns).of_motion()
-            return read_channels(source, settings.duplicates, _MOTION, motion.delay)
+            return read_channels(source, duplicates, _MOTION, motion.delay)
     except InputError as error:
         raise InputError(str(error).replace("[columns]", f"[{_MOTION}]")) from None
 
 
-def _frames(channels: Channels, settings: Settings) -> tuple[Frames, list[str]]:
-    """Return the motion of the file named in [motion], and notes."""
-    motion, height = settings.motion, settings.specimen.height
-    assert motion is not None  # checked by the caller
-    numbers, name = channels.engineering(), motion.file.name
+def _frames(channels: Channels, name: str, settings: Settings) -> tuple[Frames, list[str]]:
+    """Return the motion of the file `name`, and notes."""
+    numbers = channels.engineering()
     notes = channels.notes + [f"Not used: {item}." for item in channels.dropped]
-    top = _one_of(numbers, "displacement", "strain", 1 / height, "height", notes)
+    by = 1 / settings.specimen.height
+    top = _one_of(numbers, "displacement", "strain", by, "height", notes)
     assert top is not None  # see `Source.of_motion`
     inside = {interior_channel(k): w for k, w in _inside(numbers, top, notes).items()}
     moved, spread = {"displacement": top} | inside, settings.uncertainties.get("delay")
-    frames = Frames(name, numbers["time"], moved, motion.delay, spread)
+    frames = Frames(name, numbers["time"], moved, channels.delay, spread)
     return frames, [f"{name}: {note}" for note in notes]
 
 
 def _record(channels: Channels, settings: Settings) -> Record:
     """Return the channels of a test in SI; notes name the columns used."""
-    numbers, notes, dropped = channels.engineering(), channels.notes, channels.dropped
+    numbers, notes = channels.engineering(), channels.notes
     notes += _compare(channels.source, numbers, settings)
     specimen, striker = settings.specimen, settings.striker or Striker()
     if settings.striker is not None and "time" not in numbers:
-        notes.append(
-            "Check: there is a [striker] but no time column, so this is treated as a slow test "
-            "and the striker is not used; name the time in [columns]."
-        )
+        slow = "this is treated as a slow test and the striker is not used"
+        said = f"there is a [striker] but no time column, so {slow}"
+        notes.append(f"Check: {said}; name the time in [columns].")
     stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
     displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
     acceleration = numbers.get("acceleration")
-    derived, braked = tuple[str, ...](), stress is None
+    time, velocity, braked = numbers.get("time"), numbers.get("velocity"), stress is None
+    derived = tuple[str, ...]()
     if stress is None:
         assert striker.mass is not None  # see `Source.needed`
         ratio = striker.mass / specimen.area
@@ -215,28 +196,19 @@ def _record(channels: Channels, settings: Settings) -> Record:
             stress, acceleration = acceleration * ratio, None
             notes.append("The force is the striker's mass times its acceleration.")
         else:
-            motion = numbers["time"], displacement, numbers.get("velocity")
+            motion = numbers["time"], displacement, velocity
             stress = stress_of_motion(*motion, ratio, striker.gravity or 0.0)
             derived = ("stress",)
             notes.append(
                 "The force is the striker's mass times the deceleration of its motion, from a "
                 "smoothing spline; it is not an independent measurement."
             )
-    inside = _inside(numbers, displacement, notes)
-    return Record(
-        numbers.get("time"),
-        stress,
-        displacement,
-        numbers.get("velocity"),
-        acceleration,
-        interior=inside,
-        cycle=numbers.get("cycle"),
-        numbers=channels.rows,
-        dropped=tuple(dropped),
-        derived=derived,
-        braked=braked,
-        notes=tuple(notes),
-    )
+    record = Record(
+        time, stress, displacement, velocity, acceleration, derived=derived, braked=braked,
+        interior=_inside(numbers, displacement, notes), cycle=numbers.get("cycle"),
+        numbers=channels.rows, dropped=tuple(channels.dropped),
+    )  # fmt: skip
+    return record.noted(*notes)
 
 
 def _compare(source: Source, numbers: dict[str, Array], settings: Settings) -> list[str]:
@@ -261,17 +233,13 @@ def _compare(source: Source, numbers: dict[str, Array], settings: Settings) -> l
             other = (values - values[0]) * as_used.get(channel, 1.0)
             other = one[0] + other * np.sign(np.dot(other, one - one[0]))
             by = percent(float(np.max(np.abs(other - one)) / np.ptp(one)))
-            notes.append(
-                f"The {channel} {name} is left out; it differs by up to {by} of the range."
-            )
+            notes += [f"The {channel} {name} is left out; it differs by up to {by} of the range."]
         elif np.diff(values).min() > 0 and np.ptp(values - one) > np.median(np.diff(one)):
             both = f"columns {table.name(source.columns['time'])} and {name} are times that differ"
             by = engineering(float(np.ptp(values - one)), "s")
             if settings.striker is not None:
-                raise InputError(
-                    f"{both} by {by}; name the right one in [columns], or put a "
-                    "motion with its own clock into a file of its own ([motion])."
-                )
+                other = "put a motion with its own clock into a file of its own ([motion])"
+                raise InputError(f"{both} by {by}; name the right one in [columns], or {other}.")
             notes.append(f"Check: {both} by {by}; the first is used.")
     return notes
 

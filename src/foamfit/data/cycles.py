@@ -95,18 +95,14 @@ def choose_cycles(cycles: list[Cycle], number: int | None, last: int | None) -> 
     first = _choose(cycles, number)
     if last is None or last == number:
         return first
+    wrong = f"cycles {number} to {last} cannot be taken"
     if first is None or len(cycles) == 1:
-        raise InputError(
-            f"cycles {number} to {last} cannot be taken: the record has no cycles to choose from; "
-            "leave them out."
-        )
+        raise InputError(f"{wrong}: the record has no cycles to choose from; leave them out.")
     end = _choose(cycles, last)
     assert end is not None  # there are cycles
     if end.place <= first.place:
-        raise InputError(
-            f"cycles {number} to {last} cannot be taken: cycle {last} comes before cycle {number} "
-            f"in the file; give them in order, like {last}-{number}."
-        )
+        wrong += f": cycle {last} comes before cycle {number} in the file"
+        raise InputError(f"{wrong}; give them in order, like {last}-{number}.")
     return replace(first, end=end.end, last=end.number, turn=end.top)
 
 
@@ -128,8 +124,7 @@ def _choose(cycles: list[Cycle], number: int | None) -> Cycle | None:
 
 def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
     """Keep the samples of one loading and unloading, or of several cycles."""
-    w, n, number = record.displacement, len(cycles), cycle.number
-    assert w is not None  # it has cycles
+    w, n, number = record.curves()["displacement"], len(cycles), cycle.number
     size, start, top, end = float(np.ptp(w)), cycle.first, cycle.top, cycle.end
     notes = []
     if n > 1 or end - start < len(record):
@@ -137,22 +132,20 @@ def cut_to_cycle(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
         named, used = f"Cycle {number}", "is used"
         if cycle.last is not None:
             named, used = f"Cycles {number} to {cycle.last}", "are used as one history"
-        notes.append(
-            f"{named}{order} of {n} {used}: {end - start} of {len(record)} "
-            f"samples, {start} before and {len(record) - end} after are cut."
-        )
+        cut = f"{start} before and {len(record) - end} after are cut"
+        rows = f"{end - start} of {len(record)} samples"
+        notes.append(f"{named}{order} of {n} {used}: {rows}, {cut}.")
     largest = max(cycles, key=lambda c: float(w[c.top])).number
     share = (w[top] - w.min()) / size
     if share < _SMALLER and cycle.last is None:
+        how = f"--cycle {largest}, or [window] cycle = {largest}"
         notes.append(
             f"Check: cycle {number} reaches {percent(share)} of the largest displacement; "
-            f"cycle {largest} of {n} reaches all of it (--cycle {largest}, or [window] cycle = "
-            f"{largest})."
+            f"cycle {largest} of {n} reaches all of it ({how})."
         )
-    last = cycle.turn
-    if end == len(record) and w[last] - w[last:].min() <= _UNLOADED * size:
+    if end == len(record) and w[cycle.turn] - w[cycle.turn :].min() <= _UNLOADED * size:
         notes.append("The record has no unloading, so the unloading is undetermined.")
-    after = f"after cycle {number if cycle.last is None else cycle.last}"
+    after = f"after cycle {cycle.last or number}"
     return record.noted(*notes).between(start, end, f"before cycle {number}", after)
 
 
@@ -167,9 +160,8 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     strain not recovered is `origins["start_strain"]`. The motion `before` is kept, as a stress that
     relaxes remembers it.
     """
-    w, stress, top, number = record.displacement, record.stress, cycle.top, cycle.number
-    turn, end_of = cycle.turn, number if cycle.last is None else cycle.last
-    assert w is not None  # it has cycles
+    w, stress, top = record.curves()["displacement"], record.stress, cycle.top
+    turn, number, end_of = cycle.turn, cycle.number, cycle.last or cycle.number
     free, error = _level_between(record, cycles, cycle.place - 1)
     mean = smooth(stress, max(1, (top - cycle.first) // 100))
     glued = _is_glued(record, free, float(mean[top]))
@@ -203,10 +195,8 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     if offset < 0.0:
         notes.append(_offset_note("between the cycles", offset))
     elif loaded > _STILL_LOADED:
-        notes.append(
-            "Check: the specimen stays under load between the cycles, by "
-            f"{percent(loaded)} of the peak stress."
-        )
+        by = f"by {percent(loaded)} of the peak stress"
+        notes.append(f"Check: the specimen stays under load between the cycles, {by}.")
     moved = record.shifted("stress", offset).shifted("displacement", contact)
     moved = moved if record.time is None else moved.shifted("time", time)
     moved = replace(
@@ -226,24 +216,20 @@ def _before(record: Record, earlier: list[Cycle], last: int) -> tuple[Array, Arr
     """Return times and motion of the last cycles up to a row, with their turning points."""
     if record.time is None:
         return None
-    assert record.displacement is not None
     kept = earlier[-_REMEMBERED:]
     turns = [row for one in kept for row in (one.first, one.top)]
     rows = np.linspace(turns[0], last, _PER_CYCLE * len(kept)).astype(int)
     rows = np.unique([*rows, *turns])
-    return record.time[rows], record.displacement[rows]
+    return record.time[rows], record.curves()["displacement"][rows]
 
 
 def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
-    """Use a stress significantly below zero after the first of several cycles as its zero.
-
-    A preloaded specimen may become free only after the first cycle.
-    """
+    """Use a stress significantly below zero after the first of several cycles as its zero."""
     if cycle.last is None:
         return record
+    # A preloaded specimen may become free only after the first cycle.
     zero, error = _level_between(record, cycles, cycle.place)
-    between = record.stress[cycles[cycle.place].top : cycles[cycle.place + 1].top]
-    tension = min(zero, lowest_mean(between, 0)[0])
+    tension = min(zero, lowest_mean(record.stress[cycle.top : cycles[cycle.place + 1].top], 0)[0])
     if zero > -_SURE * error or _is_glued(record, tension, float(record.stress[cycle.top])):
         return record
     record = replace(record.shifted("stress", zero), zeros=record.zeros | {"stress": error})
@@ -251,27 +237,20 @@ def zero_between(record: Record, cycles: list[Cycle], cycle: Cycle) -> Record:
 
 
 def _offset_note(when: str, zero: float) -> str:
-    return (
-        f"The stress {when}, {engineering(zero, 'Pa')}, is taken off as the sensor's offset: "
-        "without contact the specimen bears none."
-    )
+    free, value = "without contact the specimen bears none", engineering(zero, "Pa")
+    return f"The stress {when}, {value}, is taken off as the sensor's offset: {free}."
 
 
 def _level_between(record: Record, cycles: list[Cycle], place: int) -> tuple[float, float]:
     """Return the stress at the lowest displacements between two peaks, and its standard error."""
-    w, between = record.displacement, slice(cycles[place].top, cycles[place + 1].top)
-    assert w is not None  # it has cycles
-    lowest = w[between] <= w[between].min() + _LOWEST * np.ptp(w)
-    rest = record.stress[between][lowest]
+    between, w = slice(cycles[place].top, cycles[place + 1].top), record.curves()["displacement"]
+    rest = record.stress[between][w[between] <= w[between].min() + _LOWEST * np.ptp(w)]
     return float(np.median(rest)), float(np.std(rest)) / float(np.sqrt(rest.size))
 
 
 def _is_glued(record: Record, level: float, peak: float) -> bool:
-    """Return whether a stress between cycles is tension that only a glued specimen bears.
-
-    It is not the sensor's offset, as the zero was measured before contact.
-    """
-    error = record.zeros.get("stress", np.inf)
+    """Return whether a stress between cycles is tension that only a glued specimen bears."""
+    error = record.zeros.get("stress", np.inf)  # finite if the zero was measured before contact
     return level < -max(TENSION * peak, _SURE * error)
 
 

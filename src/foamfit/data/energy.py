@@ -40,9 +40,7 @@ class EnergyAudit:
     def as_dict(self) -> dict[str, float | str | None]:
         """Return the audit as plain values; `missing` and `warnings` are joined to one text."""
         texts = {"missing": " ".join(self.missing), "warnings": " ".join(self.warnings())}
-        plain = asdict(self) | texts
-        del plain["contradictions"]
-        return plain
+        return {k: v for k, v in (asdict(self) | texts).items() if k != "contradictions"}
 
     def warnings(self) -> list[str]:
         """Return one sentence for each contradiction and each balance that does not close."""
@@ -51,29 +49,23 @@ class EnergyAudit:
 
     def energy_warnings(self) -> list[str]:
         """Return a sentence if the foam absorbs another energy than the striker brings."""
-        found, taken = [], self.absorbed_over_striker
-        if self.damping is not None:  # which takes up energy
+        taken, brought = self.absorbed_over_striker, "the energy that the striker brings"
+        if taken is None or 0.9 <= taken <= 1.05 or self.damping is not None:  # that takes it up
             return []
-        if taken is not None and taken > 1.05:
-            found.append(
-                f"Check: the foam absorbs {taken:.2f} times the energy that the striker brings, "
-                "which is impossible; mass, velocity, force and motion do not agree."
-            )
-        elif taken is not None and taken < 0.9:
-            found.append(
-                f"Check: the foam absorbs only {taken:.2f} of the energy that the striker brings; "
-                "mass, velocity, force and motion do not agree, or the record ends too early."
-            )
-        return found
+        if taken > 1.05:
+            how = f"{taken:.2f} times {brought}, which is impossible"
+            wrong = "mass, velocity, force and motion do not agree"
+        else:
+            how = f"only {taken:.2f} of {brought}"
+            wrong = "mass, velocity, force and motion do not agree, or the record ends too early"
+        return [f"Check: the foam absorbs {how}; {wrong}."]
 
     def loop_warnings(self) -> list[str]:
         """Return a sentence if the loop gives out energy."""
         if self.dissipated_fraction is None or self.dissipated_fraction >= -0.02:
             return []
-        return [
-            "Check: the loop gives out more energy than it takes up; either the record runs "
-            "backwards, or force and motion are swapped."
-        ]
+        why = "either the record runs backwards, or force and motion are swapped"
+        return [f"Check: the loop gives out more energy than it takes up; {why}."]
 
     def sentences(self) -> list[str]:
         """Return the results, the warnings and the missing quantities, one sentence each."""
@@ -95,10 +87,8 @@ class EnergyAudit:
                 f"momentum {self.momentum_change:.4g} N·s (ratio {self.impulse_ratio:.2f})."
             )
         if self.damping is not None:
-            results.append(
-                "The striker's motion shows an onsite damper, "
-                f"η = {engineering(self.damping, 'Pa·s')}, whose force the sensor does not see."
-            )
+            by = f"an onsite damper, η = {engineering(self.damping, 'Pa·s')}"
+            results += [f"The striker's motion shows {by}, whose force the sensor does not see."]
         return [*results, *self.warnings(), *self.missing]
 
 
@@ -137,20 +127,14 @@ def audit(test: Measurement) -> EnergyAudit:
     elif change is None:
         missing.append("The balance of momentum needs an impact of known mass with its rebound.")
     return EnergyAudit(
-        striker_energy=brought,
-        absorbed_energy=absorbed,
-        dissipated_energy=dissipated,
+        striker_energy=brought, absorbed_energy=absorbed, dissipated_energy=dissipated,
         dissipated_fraction=dissipated / absorbed if dissipated is not None and absorbed else None,
         absorbed_over_striker=absorbed / brought if absorbed is not None and brought else None,
-        rebound_velocity=rebound,
-        impulse=impulse,
-        momentum_change=change,
+        rebound_velocity=rebound, impulse=impulse, momentum_change=change,
         impulse_ratio=impulse / change if impulse is not None and change else None,
-        motion=test.motion,
-        missing=tuple(missing),
-        contradictions=contradictions(test, shown),
+        motion=test.motion, missing=tuple(missing), contradictions=contradictions(test, shown),
         damping=None if shown.damping is None else shown.damping[0],
-    )
+    )  # fmt: skip
 
 
 def _momentum(test: Measurement, unloaded: bool) -> tuple[float | None, float | None, float | None]:

@@ -6,20 +6,18 @@ the force with a frame then count as measured, see `Record.sampled`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from foamfit.arrays import Array, Integers, Mask, means
-from foamfit.data.measurement import MIN_ROWS, NoiseLevel, Record
-from foamfit.data.noise import averaged
-from foamfit.data.outliers import find_outliers
+from foamfit.arrays import Array, means
+from foamfit.data.measurement import MIN_ROWS, Record
+from foamfit.data.outliers import find_outliers, fresh_samples
 from foamfit.errors import InputError
 from foamfit.text import counted, engineering
 
 _FEW = 8  # fewer frames are interpolated linearly
-_SEVERAL = 2.0  # median number of frames in a block from which they are averaged
 _PAUSE = 6.0  # a longer step, in usual steps, is a pause and is interpolated linearly
 
 
@@ -62,10 +60,8 @@ def join(record: Record, frames: Frames) -> Record:
     assert time is not None  # a force without a time was rejected
     longest = max(np.ptp(time), np.ptp(frames.time))
     if (spread := frames.spread or 0.0) > longest:
-        raise InputError(
-            f"[motion] ± of delay = {engineering(spread, 's')} is longer than the record, "
-            f"{engineering(float(longest), 's')}; it must be shorter."
-        )
+        wrong = f"[motion] ± of delay = {engineering(spread, 's')} is longer than the record"
+        raise InputError(f"{wrong}, {engineering(float(longest), 's')}; it must be shorter.")
     at = frames.time + frames.delay
     slack = 1e-9 * longest  # for rounding
     outside = (time < at[0] - slack) | (time > at[-1] + slack)
@@ -75,10 +71,8 @@ def join(record: Record, frames: Frames) -> Record:
         few = f"overlaps in time with {count} samples of the force; at least {MIN_ROWS} are needed"
         shared = few if 0 < count < MIN_ROWS else "does not overlap in time with the force"
         spans = [" to ".join(engineering(float(t), "s") for t in c[[0, -1]]) for c in (time, at)]
-        raise InputError(
-            f"[motion] {frames.name} {shared}: the force is from {spans[0]}, the motion with its "
-            f"delay from {spans[1]}."
-        )
+        when = f"the force is from {spans[0]}, the motion with its delay from {spans[1]}"
+        raise InputError(f"[motion] {frames.name} {shared}: {when}.")
     record = record.without(outside, f"outside the time of {frames.name}").noted(str(frames))
     time = record.instants
     if lost := int(np.count_nonzero(~inside)):
@@ -125,34 +119,5 @@ def _averaged(at: Array, values: Array, time: Array) -> Array:
         step = 0.5 * (time[[1, -1]] - time[[0, -2]])
         near = (at >= time[0] - step[0]) & (at <= time[-1] + step[1])
         place = _nearest(time, at[near])
-        starts = np.append(0, np.flatnonzero(np.diff(place)) + 1)
-        at, values = (means(x[near], starts) for x in (at, values))
+        at, values = (means(x[near], fresh_samples(place)[0]) for x in (at, values))
     return _through(at, values, time)
-
-
-def frames_of_blocks(record: Record, thinned: Record, edges: Integers) -> Record:
-    """Reduce channels that were not measured at every sample to the blocks starting at `edges`.
-
-    A channel is averaged if blocks have several frames. Otherwise it is interpolated at the time of
-    the block, because averages of an interpolated curve would be biased.
-    """
-    middle = means(record.instants, edges)
-    for name, taken in record.sampled.items():
-        values = record.channel(name)
-        assert values is not None  # some of it was measured
-        count = np.add.reduceat(taken.astype(np.int64), edges)
-        usual = float(np.median(count))
-        measured = count >= 0.5 * usual if usual >= _SEVERAL else count > 0
-        if usual < _SEVERAL:
-            thinned = thinned.changed(name, np.interp(middle, record.instants, values))
-        if usual < _SEVERAL or not measured.all():
-            thinned = replace(thinned, sampled=thinned.sampled | {name: measured})
-    return thinned
-
-
-def noise_of_blocks(level: NoiseLevel, block: int, taken: Mask | None) -> NoiseLevel:
-    """Return the noise of blocks of samples if only those `taken` were measured."""
-    edges = np.arange(0, 0 if taken is None else taken.size, block)
-    if taken is None or np.median(np.add.reduceat(taken.astype(np.int64), edges)) >= _SEVERAL:
-        return averaged(level, block)
-    return replace(level, time=max(level.time * float(taken.mean()), 1.0))

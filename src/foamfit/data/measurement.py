@@ -101,8 +101,7 @@ class Outliers:
     """Samples of a channel that are `left_out` of the fit (n,): spikes, short gaps, clipped force.
 
     Spikes and gaps are replaced by a straight line. Their original `values` (k,), Pa or m, belong
-    to the times `at` (k,), s, or sample numbers. The force is clipped at the stress `clipped_at`,
-    Pa.
+    to the times `at` (k,), s, or sample numbers. The force is clipped at `clipped_at`, Pa.
     """
 
     left_out: Mask
@@ -159,10 +158,9 @@ class Entry:
     def _line(self, scale: str) -> str:
         scale = f'"{scale} {self.scale_unit}"' if self.scale_unit else scale
         more = f', unit = "{self.unit}"' * bool(self.unit) + f", scale = {scale}" * bool(scale)
+        more += ", counts_down = true" * self.counts_down
         column = json.dumps(self.column, ensure_ascii=False) + more
-        return (
-            f"{self.channel} = {{ column = {column}{', counts_down = true' * self.counts_down} }}"
-        )
+        return f"{self.channel} = {{ column = {column} }}"
 
     def times(self, factor: float, within: float) -> str:
         """Return the line for a channel larger by a factor, rounded `within` a share of it."""

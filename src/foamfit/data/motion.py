@@ -302,18 +302,10 @@ class _Modes:
 
 @dataclass(frozen=True, eq=False)
 class SmoothMotion:
-    """A motion without noise.
+    """A motion without noise."""
 
-    Attributes
-    ----------
-    turns : (k,) array
-        Times at which the motion turns, s.
-    sigma : float
-        Standard deviation of the noise, m.
-    """
-
-    turns: Array
-    sigma: float
+    turns: Array  #: times at which the motion turns, s, (k,)
+    sigma: float  #: standard deviation of the noise, m
     _curve: PPoly
     _modes: _Modes
     _start: float
@@ -352,21 +344,17 @@ def follow(
 
 @lru_cache(maxsize=32)
 def _cached(raw_times: bytes, raw_motion: bytes, noise: NoiseLevel) -> SmoothMotion:
-    """Run `follow` with its arrays as bytes, which can be cached.
-
-    Where samples are very uneven, as in a long hold with few of them, no spline follows them all;
-    the motion is then that of the samples.
-    """
+    """Run `follow` with its arrays as bytes, which can be cached."""
     times, w = np.frombuffer(raw_times), np.frombuffer(raw_motion)
     with suppress(linalg.LinAlgError):
         found = _found(times, w, noise)
         if _keeps_to(found, times, w):
             return found
+    # No spline follows very uneven samples, as in a long hold with few of them.
     return _exact(times, w, max(noise.sigma, residual_noise(w)[0]))
 
 
 def _keeps_to(found: SmoothMotion, times: Array, w: Array) -> bool:
-    """Return whether a motion stays near the samples between them."""
     most = max(8.0 * found.sigma, _SWINGS * float(np.ptp(w)))
     low, high = np.minimum(w[:-1], w[1:]) - most, np.maximum(w[:-1], w[1:]) + most
     between = [found.at(times[:-1] + share * np.diff(times)) for share in (0.25, 0.5, 0.75)]
@@ -415,12 +403,9 @@ def _motion(
         late, smooth = x[:, None] - instants, bend.derivative()(x)
         return smooth + (late > 0.0) @ jumps, smooth + (late >= 0.0) @ jumps
 
-    modes = _Modes(
-        BSpline(samples.knots, unit * (samples.rotation @ half[:size]), _DEGREE),
-        unit * half[size : size + k],
-        half[size + k :],
-        np.stack([instants, stderr, jumps, velocity(instants)[0]]),
-    )
+    changes = BSpline(samples.knots, unit * (samples.rotation @ half[:size]), _DEGREE)
+    kinks = np.stack([instants, stderr, jumps, velocity(instants)[0]])
+    modes = _Modes(changes, unit * half[size : size + k], half[size + k :], kinks)
     x = np.unique(np.concatenate([[0.0, 1.0], samples.x, samples.knots, instants]))
     before, after = velocity(x)
     back = np.flatnonzero(after[:-1] * before[1:] < 0.0)  # zeros of the velocity
@@ -456,13 +441,11 @@ def _corner(x: Array, y: Array, i: int, tolerance: float) -> tuple[float, float]
         if a < 2 or a + 3 >= x.size:
             continue
         before, after = ((y[j + 1] - y[j]) / (x[j + 1] - x[j]) for j in (a - 1, a + 1))
-        bends = (
-            y[a] + before * (x[a - 2] - x[a]) - y[a - 2],
-            y[a + 1] + after * (x[a + 3] - x[a + 1]) - y[a + 3],
-        )
+        lines = (a, a - 2, before), (a + 1, a + 3, after)
+        bend = max(abs(y[i] + slope * (x[j] - x[i]) - y[j]) for i, j, slope in lines)
         step = (x[a + 1] - x[a]) * max(abs(before), abs(after))
         at = (y[a + 1] - y[a] + before * x[a] - after * x[a + 1]) / ((before - after) or np.inf)
-        straight = max(map(abs, bends)) <= 0.01 * step + tolerance
+        straight = bend <= 0.01 * step + tolerance
         if straight and before * after < 0.0 and x[a] < at < x[a + 1]:
             return float(at), float(y[a] + before * (at - x[a]))
     return None
@@ -505,6 +488,5 @@ def _monotone(x: Array, values: Array, velocities: tuple[Array, Array], turns: I
     # A cubic is monotone if its slopes at the ends are at most three times that of its chord.
     over = np.where(chord, chord, np.inf)
     a, b = (chord * np.clip(v / over, 0.0, 3.0) for v in (velocities[1][:-1], velocities[0][1:]))
-    return PPoly(
-        np.stack([(a + b - 2.0 * chord) / h**2, (3.0 * chord - 2.0 * a - b) / h, a, y[:-1]]), x
-    )
+    cubic, square = (a + b - 2.0 * chord) / h**2, (3.0 * chord - 2.0 * a - b) / h
+    return PPoly(np.stack([cubic, square, a, y[:-1]]), x)

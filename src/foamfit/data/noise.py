@@ -112,12 +112,12 @@ def estimated_noise(values: Array, what: str = "samples") -> NoiseLevel:
     return NoiseLevel(sigma, False, how, correlation_time(phi))
 
 
-def noise_of_integral(values: Array, step: float) -> NoiseLevel:
-    """Return the noise of the integral of a signal sampled every `step`: that of a random walk.
+def noise_of_integral(time: Array, values: Array) -> NoiseLevel:
+    """Return the noise of the integral of a signal, shape (n,): that of a random walk.
 
     It is the RMS over the record; such noise is correlated over all of it.
     """
-    level, n = estimated_noise(values), values.size
+    level, n, step = estimated_noise(values), values.size, float(np.median(np.diff(time)))
     sigma = level.sigma * step * float(np.sqrt(0.5 * n * level.time))
     return NoiseLevel(sigma, False, f"of an integral, {level.how}", float(n))
 
@@ -200,9 +200,8 @@ def level_on_line(time: Array, values: Array, at: float, noise: NoiseLevel) -> t
     spread = float(t @ t)
     level, slope = line_at(time, values, at)
     residual = values - level - slope * (time - at)  # includes curvature of the signal
-    scatter = max(noise.sigma, float(np.sqrt(residual @ residual / max(n - 2, 1)))) * np.sqrt(
-        noise.time
-    )
+    scatter = max(noise.sigma, float(np.sqrt(residual @ residual / max(n - 2, 1))))
+    scatter *= float(np.sqrt(noise.time))
     error = scatter * np.sqrt(1.0 / n + (at - time.mean()) ** 2 / spread)
     return Level(level, float(error), n), Level(slope, float(scatter / np.sqrt(spread)), n)
 

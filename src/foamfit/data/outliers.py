@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from foamfit.arrays import Array, Integers, Mask
 from foamfit.data.measurement import MIN_ROWS, UNITS, NoiseLevel, Outliers, Record
@@ -77,7 +78,6 @@ def find_outliers(values: Array, time: Array | None = None) -> Mask:
 
 
 def _bridged(values: Array, wrong: Mask, time: Array) -> Array:
-    """Replace wrong samples by linear interpolation."""
     return np.where(wrong, np.interp(time, time[~wrong], values[~wrong]), values)
 
 
@@ -261,7 +261,7 @@ def notes_on(record: Record, spikes: dict[str, int], found: dict[str, Outliers])
     return notes + [note for note, rows in record.standstills.items() if rows.any()]
 
 
-def fresh_samples(values: Array | Mask) -> tuple[Integers, Integers]:
+def fresh_samples(values: NDArray[Any]) -> tuple[Integers, Integers]:
     """Return the samples with a new value, and the number of samples that each is held."""
     fresh = np.append(0, np.flatnonzero(np.diff(values) != 0) + 1)
     return fresh, np.diff(np.append(fresh, len(values)))
@@ -269,16 +269,12 @@ def fresh_samples(values: Array | Mask) -> tuple[Integers, Integers]:
 
 def is_staircase(values: Array) -> bool:
     """Return whether most samples repeat the previous one, and not for a coarse digitiser."""
-    fresh, lengths = fresh_samples(values)
-    return bool(np.median(lengths) >= 2) and not _is_coarse(values[fresh])
-
-
-def _is_coarse(fresh: Array) -> bool:
-    """Return whether a value usually changes by a single step of its digitiser."""
-    steps = np.abs(np.diff(fresh))
-    gaps = np.diff(np.unique(fresh))
-    gaps = gaps[gaps > 1e-6 * float(np.ptp(fresh))] if gaps.size else gaps
-    return bool(gaps.size and steps.size and np.median(steps) < 1.5 * gaps.min())
+    at, lengths = fresh_samples(values)
+    if np.median(lengths) < 2:
+        return False
+    steps, gaps = np.abs(np.diff(values[at])), np.diff(np.unique(values[at]))
+    gaps = gaps[gaps > 1e-6 * float(np.ptp(values))]
+    return not (gaps.size and np.median(steps) < 1.5 * gaps.min())  # usually by a single step
 
 
 def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
@@ -332,8 +328,8 @@ def find_standstills(record: Record) -> list[tuple[int, int]]:
         return found
     fresh, lengths = fresh_samples(w)
     noise, step = noise_level(w[fresh]), int(np.median(lengths))
-    shortest = max(_STEPS * step, _SAMPLES)
-    size, low = float(np.ptp(stress)), float(np.quantile(stress, 0.01))
+    shortest, size = max(_STEPS * step, _SAMPLES), float(np.ptp(stress))
+    low = float(np.quantile(stress, 0.01))
     for after, length in sorted(_jumps(w, noise, step, shortest).items()):
         last = after - length
         if found and last < found[-1][1]:

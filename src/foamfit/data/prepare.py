@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array, means
-from foamfit.data import blocks, contact, cycles, frames, zeros
+from foamfit.data import blocks, contact, cycles, zeros
 from foamfit.data import outliers as repair
 from foamfit.data.calibration import with_gravity
 from foamfit.data.measurement import (
@@ -20,7 +20,6 @@ from foamfit.data.measurement import (
     Dropped,
     Measurement,
     Noise,
-    NoiseLevel,
     Outliers,
     Record,
     RowCount,
@@ -51,18 +50,13 @@ _USUAL = {
     "modulus (peak stress over peak strain)": (10.0, 1e11, "Pa"),
     "duration": (1e-6, 1e7, "s"),
 }
+_WHOLE, _UNKNOWN = Window(), Noise()  # the whole file; no noise is stated
 
 
 def condition(
-    record: Record,
-    specimen: Specimen,
-    *,
-    striker: Striker | None = None,
-    window: Window | None = None,
-    spread: float = 0.0,
-    stated: Noise | None = None,
-    late: bool = False,
-) -> Measurement:
+    record: Record, specimen: Specimen, *, striker: Striker | None = None,
+    window: Window = _WHOLE, spread: float = 0.0, stated: Noise = _UNKNOWN, late: bool = False,
+) -> Measurement:  # fmt: skip
     """Reduce all samples of a file to one loading and unloading; the test has no name yet.
 
     A record with a striker and a time is an impact, any other a slow test. Channels are positive
@@ -71,8 +65,7 @@ def condition(
     is estimated from samples before contact or from those of a held channel, or that of the samples
     is `stated`. A motion that may be `late` does not show the contact.
     """
-    window, given = window or Window(), striker or Striker()
-    impact = striker is not None and record.time is not None
+    given, impact = striker or Striker(), striker is not None and record.time is not None
     if impact and window.cycle not in (None, 1):
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
     record = repair.cut_strays(cut_to_window(record, window))
@@ -109,31 +102,23 @@ def condition(
         record = cut_to_contact(record, start, span)
     record = zeros.mark_flight(record, start, span, levels) if impact else record
     record = integrate_motion(record, specimen, given)
-    if impact:
-        record = start_within_height(record, specimen, given)
-    else:
-        record = replace(record, acceleration=None)
-    whole = checks(record, specimen, given, several=used.last is not None)
+    record = start_within_height(record, specimen, given) if impact else record
+    record = record if impact else replace(record, acceleration=None)
+    whole = checks(record, specimen, several=used.last is not None)
     whole, block = blocks.without_holds(whole, impact=impact)
     record = blocks.thin(whole, block)
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
-    noise |= {c: frames.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
-    noise |= _of_velocity(whole, impact=impact)
+    noise |= {c: blocks.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
+    if is_velocity(whole) and (impact or "stress" in whole.derived):  # else it shows its noise
+        velocity = whole.curves("velocity")["velocity"]
+        noise["displacement"] = noise_of_integral(whole.instants, velocity)
     test = _measured(
-        whole,
-        record,
-        block,
-        excess,
-        specimen=specimen,
-        striker=striker and given,
-        noise=replace(_stated_of_blocks(stated or Noise(), levels, whole, block), estimated=noise),
-        contact="stress" if used.place else start.by,
-        cycle=used.number,
+        whole, record, block, excess, specimen=specimen, striker=striker and given, flight=flight,
+        noise=replace(_stated_of_blocks(stated, levels, whole, block), estimated=noise),
+        contact="stress" if used.place else start.by, cycle=used.number, last_cycle=used.last,
         cycles=tuple(cycle.number for cycle in found) or (1,),
-        last_cycle=used.last,
         rise=rise and _on_clock(rise, whole, block, 0 if used.place else span.first),
-        flight=flight,
-    )
+    )  # fmt: skip
     return with_gravity(test) if impact else test
 
 
@@ -147,29 +132,13 @@ def _on_clock(rise: contact.Kink, record: Record, block: int, first: int) -> con
     return (rise[0] - first - 0.5 * (block - 1)) / block, rise[1] / block
 
 
-def _of_velocity(record: Record, *, impact: bool) -> dict[str, NoiseLevel]:
-    """Return the noise of a motion that was integrated from a velocity.
-
-    A slow record of force and velocity shows the noise of its motion itself.
-    """
-    if not is_velocity(record) or not (impact or "stress" in record.derived):
-        return {}
-    assert record.time is not None
-    assert record.velocity is not None
-    step = float(np.median(np.diff(record.time)))
-    return {"displacement": noise_of_integral(record.velocity, step)}
-
-
 def _stated_of_blocks(stated: Noise, levels: contact.Levels, record: Record, block: int) -> Noise:
     """Return the stated noise of samples for means of blocks; `levels` give its correlation."""
-
-    def of(name: str) -> float | None:
-        if (level := stated.levels.get(name)) is None:
-            return None
+    sigmas = dict[str, float]()
+    for name, level in stated.levels.items():
         level = replace(level, time=levels[name].time if name in levels else 1.0)
-        return frames.noise_of_blocks(level, block, record.sampled.get(name)).sigma
-
-    return Noise(of("stress"), of("displacement"))
+        sigmas[name] = blocks.noise_of_blocks(level, block, record.sampled.get(name)).sigma
+    return Noise(sigmas.get("stress"), sigmas.get("displacement"))
 
 
 def _contact_of_impact(
@@ -197,29 +166,16 @@ def _measured(
     spikes = {name: int(np.count_nonzero(values)) for name, values in excess.items()}
     origins = dict(whole.origins)
     return Measurement(
-        name="",  # name, file and digest follow later
-        path=None,
-        data_sha256="",
-        time=thinned.time,
-        stress=thinned.stress,
-        displacement=thinned.displacement,
-        acceleration=thinned.acceleration,
-        motion=whole.motion,
+        name="", path=None, data_sha256="",  # these follow later
+        time=thinned.time, stress=thinned.stress, displacement=thinned.displacement,
+        acceleration=thinned.acceleration, interior=thinned.interior, sampled=thinned.sampled,
         notes=(*thinned.notes, *repair.notes_on(whole, spikes, outliers)),
-        interior=thinned.interior,
-        outliers=outliers,
-        count=count_rows(whole, outliers, block),
-        start_strain=origins.pop("start_strain", 0.0),
-        before=whole.before,
-        sampled=thinned.sampled,
-        zeros=whole.zeros,
-        origins=origins,
-        derived=whole.derived,
-        braked=whole.braked,
-        block=block,
+        outliers=outliers, count=count_rows(whole, outliers, block), block=block,
+        start_strain=origins.pop("start_strain", 0.0), origins=origins, zeros=whole.zeros,
+        motion=whole.motion, before=whole.before, derived=whole.derived, braked=whole.braked,
         standstills=tuple((float(at[0]), float(at[-1])) for at in stood),
         **known,
-    )
+    )  # fmt: skip
 
 
 def first_rise(record: Record, start: contact.Start, levels: contact.Levels) -> contact.Kink | None:
@@ -261,10 +217,8 @@ def cut_to_window(record: Record, window: Window) -> Record:
     kept = int(inside.sum())
     if kept < MIN_ROWS:
         first, last = (engineering(float(t), "s") for t in record.time[[0, -1]])
-        raise InputError(
-            f"[window] start and end leave {kept} samples; at least {MIN_ROWS} between {first} and "
-            f"{last} are needed."
-        )
+        needed = f"at least {MIN_ROWS} between {first} and {last} are needed"
+        raise InputError(f"[window] start and end leave {kept} samples; {needed}.")
     note = f"[window] cut {len(record) - kept} of {len(record)} samples."
     record = record.without(~inside, "outside [window] start and end").noted(note)
     for name, values in record.curves().items():
@@ -350,8 +304,7 @@ def stress_of_motion(
 
 def start_within_height(record: Record, specimen: Specimen, striker: Striker) -> Record:
     """Delay the contact of an impact if the displacement would otherwise exceed the height."""
-    w, most = record.displacement, 0.97 * specimen.height
-    assert w is not None  # measured or integrated by now
+    w, most = record.curves()["displacement"], 0.97 * specimen.height
     over, limit = float(w.max()) - most, 0.5 if "stress" in record.derived else 0.2
     if not striker.velocity or not 0.03 * specimen.height <= over < limit * specimen.height:
         return record
@@ -361,18 +314,13 @@ def start_within_height(record: Record, specimen: Specimen, striker: Striker) ->
         record = record.shifted("displacement", over)
     else:  # an integrated motion has no zero in the file
         record = record.changed("displacement", w - over)
-    return record.noted(
-        f"Contact is assumed {engineering(late, 's')} later, so that the displacement does not "
-        "exceed the height."
-    )
+    done = f"Contact is assumed {engineering(late, 's')} later"
+    return record.noted(f"{done}, so that the displacement does not exceed the height.")
 
 
-def checks(
-    record: Record, specimen: Specimen, striker: Striker, *, several: bool = False
-) -> Record:
+def checks(record: Record, specimen: Specimen, *, several: bool) -> Record:
     """Reject strains beyond one, note implausible data (no reversals of `several` cycles)."""
-    displacement, height = record.displacement, specimen.height
-    assert displacement is not None  # measured or integrated by now
+    displacement, height = record.curves()["displacement"], specimen.height
     notes, motion = list[str](), record.motion
     if motion != MEASURED:
         notes.append(f"The file has no displacement: the motion is {motion}.")
@@ -391,10 +339,8 @@ def checks(
     for value, (name, (low, high, unit)) in zip(sizes, _USUAL.items(), strict=True):
         if not low <= value <= high:
             shown, least, most = (f"{v:.4g} {unit}".strip() for v in (value, low, high))
-            notes.append(
-                f"Check: the {name} is {shown}, but {least} to {most} is usual in tests; "
-                "check the units (mm or Mm, mN or MN)."
-            )
+            said = f"the {name} is {shown}, but {least} to {most} is usual in tests"
+            notes.append(f"Check: {said}; check the units (mm or Mm, mN or MN).")
     for node, values in record.interior.items():
         name, largest = interior_channel(node), float(values.max())
         if largest >= height:
@@ -419,21 +365,18 @@ def checks(
 
 def _never_positive(stress: Array) -> InputError:
     least, most = (engineering(float(v) + 0.0, "Pa") for v in (stress.min(), stress.max()))
-    return InputError(
-        f"the stress is never positive in the part that is used, only {least} to {most}; correct "
-        "its zero in the file, or choose another part or cycle by [window]."
-    )
+    wrong = f"the stress is never positive in the part that is used, only {least} to {most}"
+    remedy = "correct its zero in the file, or choose another part or cycle by [window]"
+    return InputError(f"{wrong}; {remedy}.")
 
 
 def count_rows(record: Record, outliers: dict[str, Outliers], block: int) -> RowCount:
     """Count the rows of the file that are used, and those dropped with the reasons."""
     dropped, used = list(record.dropped), np.ones(len(record), dtype=bool)
     of_blocks = {c: np.repeat(o.left_out, block)[: len(record)] for c, o in outliers.items()}
-    reasons = {
-        f"a spike or gap of the {name}, bridged by a straight line": excess != 0.0
-        for name, excess in record.excess.items()
-    }
-    reasons["the displacement stands still, bridged by a straight line"] = record.stood_still
+    line, excess = "bridged by a straight line", record.excess
+    reasons = {f"a spike or gap of the {c}, {line}": spikes != 0.0 for c, spikes in excess.items()}
+    reasons[f"the displacement stands still, {line}"] = record.stood_still
     if record.clipped is not None:
         reasons["the force is clipped"] = of_blocks["stress"] & record.clipped
     for name, left_out in of_blocks.items():

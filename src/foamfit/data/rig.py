@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import accumulate, pairwise, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data import toml_file as toml
 from foamfit.data.cycles import loading_rate
 from foamfit.data.measurement import (
     MEASURED,
@@ -22,18 +23,6 @@ from foamfit.data.measurement import (
     interior_channel,
 )
 from foamfit.data.noise import with_noise
-from foamfit.data.toml_file import (
-    COUNT,
-    FLAG,
-    Check,
-    Quantity,
-    Several,
-    Span,
-    Table,
-    check_keys,
-    checked_tables,
-    load_toml,
-)
 from foamfit.errors import InputError, naming
 from foamfit.text import engineering, listed
 
@@ -44,7 +33,7 @@ Range = tuple[float, float]
 class Strain:
     """Check of a strain, or of a range of strains, between 0 and 1."""
 
-    positive: Quantity
+    positive: toml.Quantity
 
     def __call__(self, value: Any, where: str) -> Any:
         """Return the strain, or the ends of the range."""
@@ -55,29 +44,26 @@ class Strain:
         return found
 
 
-_RIG: dict[str, dict[str, Check]] = {
+_RIG: dict[str, dict[str, toml.Check]] = {
     "striker": {
-        "velocity": Span("m/s", "0.5 to 6 m/s"),
-        "masses": Several(Quantity("kg", "7 g"), 'like ["7 g", "14 g"]'),
+        "velocity": toml.Span("m/s", "0.5 to 6 m/s"),
+        "masses": toml.Several(toml.Quantity("kg", "7 g"), 'like ["7 g", "14 g"]'),
     },
     "machine": {
-        "rate": Span("1/s", "0.01 to 10 1/s"),
-        "strain": Strain(Span("", "0.1 to 0.7")),
-        "cycles": COUNT,
-        "hold": Quantity("s", "10 s"),
+        "rate": toml.Span("1/s", "0.01 to 10 1/s"),
+        "strain": Strain(toml.Span("", "0.1 to 0.7")),
+        "cycles": toml.COUNT,
+        "hold": toml.Quantity("s", "10 s"),
     },
     "limits": {
-        "force": Quantity("N", "500 N"),
-        "displacement": Quantity("m", "1 mm"),
-        "strain": Strain(Quantity("", "0.9")),
+        "force": toml.Quantity("N", "500 N"),
+        "displacement": toml.Quantity("m", "1 mm"),
+        "strain": Strain(toml.Quantity("", "0.9")),
     },
     "record": {
-        "rate": Quantity("1/s", "1 MHz"),
-        "noise": Table(
-            {"stress": Quantity("Pa", "20 kPa"), "displacement": Quantity("m", "2 um")},
-            '{ stress = "20 kPa" }',
-        ),
-        "interior": FLAG,
+        "rate": toml.Quantity("1/s", "1 MHz"),
+        "noise": toml.Table(toml.NOISE, '{ stress = "20 kPa" }'),
+        "interior": toml.FLAG,
     },
 }
 VELOCITIES, STRAINS, RATES = 24, 5, 5  # numbers of candidates over each range
@@ -115,8 +101,8 @@ class Rig:
     @property
     def limits(self) -> str:
         """The limits in words."""
-        shown = [engineering(self.force, "N")] if math.isfinite(self.force) else []
-        shown += [engineering(self.displacement, "m")] if math.isfinite(self.displacement) else []
+        largest = (self.force, "N"), (self.displacement, "m")
+        shown = (engineering(most, unit) for most, unit in largest if math.isfinite(most))
         return listed([*shown, f"a strain of {self.largest_strain:g}"])
 
 
@@ -149,17 +135,13 @@ class Candidate:
         """Return times (s) and displacements (m) of a slow test of a specimen."""
         assert self.strain is not None
         assert self.rate is not None
-        ramp = self.strain / self.rate
-        corners, levels = [0.0], [0.0]
-        for _ in range(self.cycles):
-            corners += [corners[-1] + ramp, *([corners[-1] + ramp + self.hold] * bool(self.hold))]
-            corners += [corners[-1] + ramp]
-            levels += [self.strain, *([self.strain] * bool(self.hold)), 0.0]
-        parts = [
-            np.linspace(a, b, CYCLE_SAMPLES // 2, endpoint=False) for a, b in pairwise(corners)
-        ]
+        ramp, top, rows = self.strain / self.rate, self.strain, CYCLE_SAMPLES // 2
+        hold = [(self.hold, top)] if self.hold else []
+        lasts, levels = zip(*[(ramp, top), *hold, (ramp, 0.0)] * self.cycles, strict=True)
+        corners = [0.0, *accumulate(lasts)]
+        parts = [np.linspace(*ends, rows, endpoint=False) for ends in pairwise(corners)]
         time = np.append(np.concatenate(parts), corners[-1])
-        return time, height * np.interp(time, corners, levels)
+        return time, height * np.interp(time, corners, [0.0, *levels])
 
     def recorded(
         self, test: Measurement, rig: Rig, lasts: float, peak: float, *, with_motion: bool = False
@@ -175,20 +157,17 @@ class Candidate:
         striker = None
         if self.drive == "impact":
             time = np.linspace(0.0, lasts, IMPACT_SAMPLES)
-            moved: Array | None = np.linspace(0.0, 0.5 * height, time.size)
-            alone = test.displacement is None and test.striker is not None
-            moved = None if alone and not with_motion else moved
+            alone = test.displacement is None and test.striker is not None and not with_motion
+            moved = None if alone else np.linspace(0.0, 0.5 * height, time.size)
             striker = replace(test.striker or Striker(), mass=self.mass, velocity=self.velocity)
             was = test.striker and test.striker.velocity
             if was and self.velocity and "velocity" in spreads:
                 spreads["velocity"] *= self.velocity / was
         else:
             time, moved = self.motion(height)
-        levels = {
-            channel: NoiseLevel(sigma, getattr(known, channel) is not None, "the rig")
-            for channel, sigma in rig.noise.items()
-        }
-        seen = {*test.interior, *([] if self.interior is None else [self.interior])}
+        given = {c: c in known.levels for c in rig.noise}
+        levels = {c: NoiseLevel(sigma, given[c], "the rig") for c, sigma in rig.noise.items()}
+        seen = {*test.interior, *filter(None, [self.interior])}
         ramp = np.linspace(0.0, 1.0, time.size)
         levels |= {interior_channel(node): levels["displacement"] for node in seen}
         if striker is None:
@@ -203,12 +182,8 @@ class Candidate:
         )  # fmt: skip
 
     def weight(self, time: Array, test: Measurement, rig: Rig) -> float:
-        """Return the number of samples of the rig per simulated sample.
-
-        A rate for impacts would be a thousand million rows in a slow test, which has as many per
-        cycle as the record at hand.
-        """
-        if rig.sampling is not None and self.mass is not None:
+        """Return the number of samples of the rig per simulated sample."""
+        if rig.sampling is not None and self.mass is not None:  # the rate of impacts
             return rig.sampling * float(time[-1] - time[0]) / time.size
         rows = test.rows.used if test.displacement is None else test.displacement.size
         return rows / max(len(test.cycles), 1) * self.cycles / time.size
@@ -218,10 +193,8 @@ class Candidate:
         height, area = test.specimen.height * 1e3, test.specimen.area * 1e6
         lines = [
             f"# {self}: advised by foamfit plan. Put this beside the record, with the same name.",
-            "[specimen]",
-            f'height = "{height:.6g} mm"',
-            f'area = "{area:.6g} mm^2"',
-        ]
+            "[specimen]", f'height = "{height:.6g} mm"', f'area = "{area:.6g} mm^2"',
+        ]  # fmt: skip
         if test.specimen.mass is not None:
             lines.append(f'mass = "{test.specimen.mass * 1e6:.6g} mg"')
         if test.specimen.heights is not None:
@@ -238,7 +211,7 @@ class Candidate:
         if self.interior:
             name = interior_channel(self.interior)
             lines.append(f"# Record the displacement of interior mass {self.interior} as {name}.")
-        return "\n".join(lines) + "\n"
+        return "\n".join([*lines, ""])
 
 
 def candidates(rig: Rig, test: Measurement, springs: int) -> list[Candidate]:
@@ -250,31 +223,23 @@ def candidates(rig: Rig, test: Measurement, springs: int) -> list[Candidate]:
     for mass, speed, node in product(rig.masses, speeds, inner):
         out.append(Candidate("impact", mass, float(f"{speed:.4g}"), interior=node))
     if rig.rates[0] > 0.0:
-        counts = sorted({1, rig.cycles})
         grid = _spread(rig.strain, STRAINS), _spread(rig.rates, RATES)
-        for strain, rate, cycles in product(*grid, counts):
+        for strain, rate, cycles in product(*grid, sorted({1, rig.cycles})):
             out.append(Candidate("displacement", strain=strain, rate=rate, cycles=cycles))
         for strain, rate in product(grid[0], grid[1] if rig.hold else ()):
             out.append(Candidate("displacement", strain=strain, rate=rate, hold=rig.hold))
-    again = _again(test, rig)
-    return [*out, *([] if again is None else [again])]
+    striker, own = test.striker, loading_rate(test)
+    if striker is not None and striker.mass and striker.velocity:
+        out.append(Candidate("impact", striker.mass, striker.velocity, repeat=True))
+    elif test.displacement is not None and own is not None and rig.rates[0] > 0.0:
+        largest = float(np.max(test.displacement)) / test.specimen.height
+        out.append(Candidate("displacement", strain=largest, rate=own, repeat=True))
+    return out
 
 
 def _spread(ends: Range, count: int) -> list[float]:
-    """Return values spread evenly in ratio over a range."""
     values = np.geomspace(*ends, count if ends[1] > ends[0] else 1)
     return [float(f"{value:.3g}") for value in values]
-
-
-def _again(test: Measurement, rig: Rig) -> Candidate | None:
-    """Return a repeat of the test at hand."""
-    striker, rate = test.striker, loading_rate(test)
-    if striker is not None and striker.mass and striker.velocity:
-        return Candidate("impact", striker.mass, striker.velocity, repeat=True)
-    if test.displacement is None or rate is None or not rig.rates[0] > 0.0:
-        return None
-    strain = float(np.max(test.displacement)) / test.specimen.height
-    return Candidate("displacement", strain=strain, rate=rate, repeat=True)
 
 
 def read_rig(path: Path | None, test: Measurement, *, relaxing: bool = False) -> Rig:
@@ -285,14 +250,14 @@ def read_rig(path: Path | None, test: Measurement, *, relaxing: bool = False) ->
     """
     if path is None:
         return _completed({name: {} for name in _RIG}, test, relaxing)
-    document = load_toml(path, "a rig is a TOML with [striker], [limits], …; foamfit init --rig")
+    right = "a rig is a TOML with [striker], [limits], …; foamfit init --rig"
+    document = toml.load_toml(path, right)
     with naming(path):
-        check_keys("a rig", document, _RIG)
-        return _completed(checked_tables(document, _RIG), test, relaxing)
+        toml.check_keys("a rig", document, _RIG)
+        return _completed(toml.checked_tables(document, _RIG), test, relaxing)
 
 
 def _completed(stated: dict[str, dict[str, Any]], test: Measurement, relaxing: bool) -> Rig:
-    """Return the rig, completed from a record."""
     test, notes = with_noise(test), list[str]()
     hits, machine, limits, record = (stated[name] for name in _RIG)
 
@@ -302,53 +267,42 @@ def _completed(stated: dict[str, dict[str, Any]], test: Measurement, relaxing: b
             notes.append(said)
 
     striker, rate = test.striker or Striker(), loading_rate(test)
-    if striker.mass and "masses" not in hits:
+    if striker.mass:
         assume(hits, "masses", (striker.mass,), "the mass of the striker")
     if striker.velocity and "masses" in hits:
         low, high = (factor * striker.velocity for factor in FASTER)
-        said = f"velocities from {low:.3g} to {high:.3g} m/s"
-        assume(hits, "velocity", (low, high), said)
+        assume(hits, "velocity", (low, high), f"velocities from {low:.3g} to {high:.3g} m/s")
     if "masses" in hits and "velocity" not in hits:
         raise InputError('[striker] velocity is missing; give it like "0.5 to 6 m/s".')
     slow = "masses" not in hits and rate is not None and test.displacement is not None
     if machine or slow:
-        w, most = test.displacement, 0.5
-        most = most if w is None else float(w.max()) / test.specimen.height
+        w = test.displacement
+        most = 0.5 if w is None else float(w.max()) / test.specimen.height
         low, high = FARTHER[0] * most, min(FARTHER[1] * most, 0.9)
         assume(machine, "strain", (low, high), f"strains from {low:.2g} to {high:.2g}")
         near = rate if rate is not None and "masses" not in hits else 0.1
         low, high = (factor * near for factor in RATE_RANGE)
-        said = f"strain rates from {low:.3g} to {high:.3g} 1/s"
-        assume(machine, "rate", (low, high), said)
+        assume(machine, "rate", (low, high), f"strain rates from {low:.3g} to {high:.3g} 1/s")
     if relaxing and slow and test.time is not None:
         lasts = LONG_HOLD * float(test.time[-1] - test.time[0])
         assume(machine, "hold", lasts, f"a hold of {engineering(lasts, 's')}")
     if "masses" in hits and test.time is not None:
         rate = 1.0 / float(np.median(np.diff(test.time)))
         assume(record, "rate", rate, f"{engineering(rate, 'Hz')} sampling")
-    noise = record.get("noise", {})
-    usual = {"displacement": 1e-3 * test.specimen.height}
-    if test.stress is not None:
-        usual["stress"] = 0.01 * float(np.ptp(test.stress))
+    noise, small = record.get("noise", {}), 1e-3 * test.specimen.height
+    usual = {"stress": small if test.stress is None else 0.01 * float(np.ptp(test.stress))}
     for channel, unit in (("stress", "Pa"), ("displacement", "m")):
         level = test.noise.of(channel)
-        sigma = level.sigma if level and level.sigma else usual.get(channel, usual["displacement"])
+        sigma = level.sigma if level and level.sigma else usual.get(channel, small)
         assume(noise, channel, sigma, f"noise of {engineering(sigma, unit)} ({channel})")
     return Rig(
-        velocity=hits.get("velocity", (0.0, 0.0)),
-        masses=hits.get("masses", ()),
-        strain=machine.get("strain", (0.0, 0.0)),
-        rates=machine.get("rate", (0.0, 0.0)),
-        cycles=machine.get("cycles", max(len(test.cycles), 1)),
-        hold=machine.get("hold", 0.0),
-        force=limits.get("force", math.inf),
-        displacement=limits.get("displacement", math.inf),
-        largest_strain=limits.get("strain", LOCK_UP),
-        sampling=record.get("rate"),
-        noise=noise,
-        interior=record.get("interior", bool(test.interior)),
-        notes=tuple(notes),
-    )
+        velocity=hits.get("velocity", (0.0, 0.0)), masses=hits.get("masses", ()),
+        strain=machine.get("strain", (0.0, 0.0)), rates=machine.get("rate", (0.0, 0.0)),
+        cycles=machine.get("cycles", max(len(test.cycles), 1)), hold=machine.get("hold", 0.0),
+        force=limits.get("force", math.inf), displacement=limits.get("displacement", math.inf),
+        largest_strain=limits.get("strain", LOCK_UP), sampling=record.get("rate"), noise=noise,
+        interior=record.get("interior", bool(test.interior)), notes=tuple(notes),
+    )  # fmt: skip
 
 
 def beyond(rig: Rig, springs: int) -> Iterator[tuple[str, Rig]]:

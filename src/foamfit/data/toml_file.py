@@ -20,25 +20,12 @@ import math
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from foamfit.data.measurement import (
-    GRAVITY,
-    Entry,
-    Noise,
-    Specimen,
-    Striker,
-    Window,
-    interior_node,
-)
-from foamfit.data.units import (
-    is_unit,
-    parse_quantity,
-    parse_uncertain,
-    split_quantity,
-    split_uncertain,
-)
+from foamfit.data import units
+from foamfit.data.measurement import GRAVITY, Entry, Noise, Specimen, Striker, Window, interior_node
 from foamfit.errors import InputError, naming
 from foamfit.files import read_whole
 from foamfit.terminal import printable
@@ -84,9 +71,9 @@ class Quantity:
         """Return the quantity in SI."""
         given, sigma = (value, self.si, where, self.example), None
         if self.uncertain:
-            number, sigma = parse_uncertain(*given, zero=not self.positive)
+            number, sigma = units.parse_uncertain(*given, zero=not self.positive)
         else:
-            number = parse_quantity(*given)
+            number = units.parse_quantity(*given)
         if self.positive and number <= 0.0:
             raise InputError(f'{where} = "{value}" must be positive, like "{self.example}".')
         return Stated(number, sigma) if self.uncertain else number
@@ -98,10 +85,10 @@ class Span(Quantity):
     def __call__(self, value: Any, where: str) -> tuple[float, float]:
         """Return the ends in SI, in ascending order."""
         ends = value.split(" to ") if isinstance(value, str) else [value]
-        first, last = (split_quantity(str(ends[i])) for i in (0, -1))
+        first, last = (units.split_quantity(str(ends[i])) for i in (0, -1))
         if len(ends) == 2 and first and last and not first[1]:
             ends[0] = f"{ends[0]} {last[1]}"
-        found = [parse_quantity(end, self.si, where, self.example) for end in ends]
+        found = [units.parse_quantity(end, self.si, where, self.example) for end in ends]
         if len(found) > 2 or found[0] <= 0.0 or found != sorted(found):
             wanted = f'a range of positive values, like "{self.example}"'
             raise InputError(f'{where} = "{value}" must be {wanted}.')
@@ -200,9 +187,7 @@ def checked_tables(
     document: Mapping[str, Any], tables: Mapping[str, Mapping[str, Check]]
 ) -> dict[str, dict[str, Any]]:
     """Return the checked values of the tables of a document, by table and key."""
-    return {
-        name: checked(table_of(document, name), keys, f"[{name}]") for name, keys in tables.items()
-    }
+    return {name: checked(table_of(document, name), tables[name], f"[{name}]") for name in tables}
 
 
 def checked(
@@ -210,33 +195,38 @@ def checked(
 ) -> dict[str, Any]:
     """Return the checked values of a table by key; keys that are not `needed` may be missing."""
     check_keys(where.removesuffix(":"), table, keys)
-    for key in needed:
-        if key not in table:
-            check = keys[key]
-            remedy = f"it must be {getattr(check, 'right', '')}"
-            if isinstance(check, Quantity):
-                example = f'"{check.example}"' if check.si else check.example
-                remedy = f"give it like {key} = {example}"
-            raise InputError(f"{where} {key} is missing; {remedy}.")
+    for key in (key for key in needed if key not in table):
+        check = keys[key]
+        remedy = f"it must be {getattr(check, 'right', '')}"
+        if isinstance(check, Quantity):
+            example = f'"{check.example}"' if check.si else check.example
+            remedy = f"give it like {key} = {example}"
+        raise InputError(f"{where} {key} is missing; {remedy}.")
     return {key: keys[key](value, f"{where} {key}") for key, value in table.items()}
 
 
+_FILE = Rule(
+    lambda v: isinstance(v, str) and v.strip() != "" and "\0" not in v, 'a file, like "camera.csv"'
+)
+NOISE: dict[str, Check] = {
+    "stress": Quantity("Pa", "20 kPa"),
+    "displacement": Quantity("m", "2 um"),
+}
+_stated = partial(Quantity, uncertain=True)
 _SECTIONS: dict[str, dict[str, Check]] = {
     "specimen": {
-        "height": Quantity("m", "1.19 mm", uncertain=True),
-        "diameter": Quantity("m", "5 mm", uncertain=True),
-        "area": Quantity("m**2", "19.6 mm^2", uncertain=True),
-        "mass": Quantity("kg", "5.56 mg", uncertain=True),
-        "heights": Several(
-            Quantity("m", "0.7 mm", uncertain=True), 'like ["0.700 mm", "0.490 mm"], base first'
-        ),
+        "height": _stated("m", "1.19 mm"),
+        "diameter": _stated("m", "5 mm"),
+        "area": _stated("m**2", "19.6 mm^2"),
+        "mass": _stated("kg", "5.56 mg"),
+        "heights": Several(_stated("m", "0.7 mm"), 'like ["0.700 mm", "0.490 mm"], base first'),
     },
     "striker": {
-        "mass": Quantity("kg", "7 g", uncertain=True),
-        "velocity": Quantity("m/s", "1.75 m/s", uncertain=True),
+        "mass": _stated("kg", "7 g"),
+        "velocity": _stated("m/s", "1.75 m/s"),
         "gravity": FLAG,
     },
-    "noise": {"stress": Quantity("Pa", "20 kPa"), "displacement": Quantity("m", "2 um")},
+    "noise": NOISE,
     "window": {
         "start": Quantity("s", "0.5 ms", positive=False),
         "end": Quantity("s", "2 ms", positive=False),
@@ -247,22 +237,17 @@ _SECTIONS: dict[str, dict[str, Check]] = {
         "duplicates": Rule(lambda v: v in ("average", "refuse"), "one of average, refuse"),
         "sheet": Rule(lambda v: isinstance(v, str), 'a name, like "Sheet1"'),
     },
+    "motion": {
+        "file": _FILE,
+        "delay": _stated("s", "0 ± 50 us", positive=False),
+        "columns": anything,
+    },
 }
 _NAME = Rule(
     lambda v: isinstance(v, str) and v.strip() != "" and v.isprintable() and len(v) <= LONGEST,
     f"a printable text of {LONGEST} characters at most, in quotation marks",
 )
 _PRIOR = Rule(lambda v: isinstance(v, str), 'like "5.5 ± 0.1 MPa"')
-_FILE = Rule(
-    lambda v: isinstance(v, str) and v.strip() != "" and "\0" not in v, 'a file, like "camera.csv"'
-)
-_MOTION: dict[str, Check] = {
-    "file": _FILE,
-    "delay": Quantity("s", "0 ± 50 us", positive=False, uncertain=True),
-    "columns": anything,
-}
-# Names in `Settings.uncertainties` that differ from the key.
-_SPREADS = {"specimen mass": "specimen_mass", "striker mass": "striker_mass"}
 _SCALE = "4444.4 N/V"
 # Channels of a [motion] file, in addition to displacements of interior masses.
 MOTION_CHANNELS = "time", "displacement", "strain", "velocity"
@@ -301,7 +286,8 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
     and the invalid or missing key.
     """
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
-    check_keys(f"{path}:", document, ["name", "columns", "motion", "priors", *_SECTIONS])
+    tables = dict.fromkeys(["columns", "motion", "priors", *_SECTIONS])
+    check_keys(f"{path}:", document, ["name", *tables])
     with naming(path):
         values, spreads = _split(checked_tables(document, _SECTIONS))
         window, striker, priors = values["window"], values["striker"], table_of(document, "priors")
@@ -311,38 +297,31 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
             window["cycle"], window["last"] = window.pop("cycles")
         if "gravity" in striker:
             striker["gravity"] = GRAVITY if striker["gravity"] else 0.0
-        motion, delay = _motion(path, document)
         return Settings(
             name=_NAME(document.get("name", printable(toml_beside(test).stem)), "name"),
-            specimen=_specimen(values["specimen"], spreads),
+            specimen=_specimen(values["specimen"], spreads), uncertainties=spreads,
             striker=Striker(**striker) if striker else None,
-            noise=Noise(**values["noise"]),
-            window=Window(**window),
+            noise=Noise(**values["noise"]), window=Window(**window), **values["data"],
             columns=_columns(table_of(document, "columns"), channels),
-            uncertainties=spreads | ({"delay": delay} if delay else {}),
-            motion=motion,
+            motion=_motion(path, values["motion"]) if "motion" in document else None,
             # Its keys depend on the model; the fit checks them.
             priors={key: _PRIOR(value, f"[priors] {key}") for key, value in priors.items()},
-            **values["data"],
-        )
+        )  # fmt: skip
 
 
 def _split(tables: dict[str, dict[str, Any]]) -> tuple[dict[str, dict[str, Any]], dict[str, float]]:
     """Separate the values of the tables from the standard deviations."""
     spreads = dict[str, float | None]()
 
-    def value(found: Any, name: str) -> Any:
+    def value(found: Any, section: str, key: str) -> Any:
         if isinstance(found, Stated):
-            spreads[_SPREADS.get(name, name.partition(" ")[2])] = found.sigma
+            spreads[f"{section}_mass" if key == "mass" else key] = found.sigma
             return found.value
-        if isinstance(found, tuple) and name == "specimen heights":
-            return tuple(value(one, f"specimen height_{i}") for i, one in enumerate(found, 1))
+        if key == "heights":
+            return tuple(value(one, section, f"height_{i}") for i, one in enumerate(found, 1))
         return found
 
-    values = {
-        name: {key: value(found, f"{name} {key}") for key, found in table.items()}
-        for name, table in tables.items()
-    }
+    values = {s: {k: value(v, s, k) for k, v in table.items()} for s, table in tables.items()}
     return values, {name: sigma for name, sigma in spreads.items() if sigma}
 
 
@@ -380,16 +359,20 @@ def motion_file(toml: Path) -> Path | None:
         return None
 
 
-def _motion(path: Path, document: dict[str, Any]) -> tuple[Motion | None, float | None]:
-    """Return the motion in a file of its own, and the standard deviation of its delay, s."""
-    if "motion" not in document:
-        return None, None
-    found = {"delay": Stated(0.0, None)} | checked(
-        table_of(document, "motion"), _MOTION, "[motion]", ["file"]
-    )
-    columns = _columns(table_of(found, "columns", "motion."), MOTION_CHANNELS, "motion.columns")
-    delay = found["delay"]
-    return Motion(path.parent / found["file"], columns, delay.value), delay.sigma
+def _motion(path: Path, values: dict[str, Any]) -> Motion:
+    if "file" not in values:
+        raise InputError(f"[motion] file is missing; it must be {_FILE.right}.")
+    columns = _columns(table_of(values, "columns", "motion."), MOTION_CHANNELS, "motion.columns")
+    return Motion(path.parent / values["file"], columns, values.get("delay", 0.0))
+
+
+def _scale(value: Any, where: str) -> tuple[float, str, float | None]:
+    """Return number, unit and standard deviation of a scale, such as "4444.4 ± 5 N/V"."""
+    text = str(value)
+    parts = units.split_quantity(units.split_uncertain(text)[0])
+    if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not units.is_unit(parts[1]):
+        raise InputError(f'{where} = {value!r} must be like -1 or "{_SCALE}".')
+    return *parts, units.parse_uncertain(text, parts[1], where, _SCALE)[1]
 
 
 _COLUMN: dict[str, Check] = {
@@ -397,8 +380,10 @@ _COLUMN: dict[str, Check] = {
         lambda v: isinstance(v, str) or (type(v) is int and v > 0),
         'a header or a number, like column = "Load" or column = 2',
     ),
-    "unit": Rule(lambda v: isinstance(v, str) and is_unit(v), 'a known unit, like unit = "mm"'),
-    "scale": lambda value, where: _scale(value, where),
+    "unit": Rule(
+        lambda v: isinstance(v, str) and units.is_unit(v), 'a known unit, like unit = "mm"'
+    ),
+    "scale": _scale,
     "counts_down": FLAG,
 }
 
@@ -416,16 +401,7 @@ def _columns(
         found = Table(keys, right, ("column",))(entry, where)
         number, unit, sigma = found.pop("scale", (1.0, "", None))
         if sigma is not None and (inside or channel in ("time", "cycle")):
-            parse_quantity(entry["scale"], unit, f"{where}: scale", _SCALE)  # refuses the ±
+            units.parse_quantity(entry["scale"], unit, f"{where}: scale", _SCALE)  # refuses the ±
         spread = (sigma or 0.0) / abs(number)
         columns[channel] = Entry(channel, **found, scale=number, scale_unit=unit, spread=spread)
     return columns
-
-
-def _scale(value: Any, where: str) -> tuple[float, str, float | None]:
-    """Return number, unit and standard deviation of a scale, such as "4444.4 ± 5 N/V"."""
-    text = str(value)
-    parts = split_quantity(split_uncertain(text)[0])
-    if parts is None or parts[0] in (0.0, math.inf, -math.inf) or not is_unit(parts[1]):
-        raise InputError(f'{where} = {value!r} must be like -1 or "{_SCALE}".')
-    return *parts, parse_uncertain(text, parts[1], where, _SCALE)[1]

@@ -130,17 +130,14 @@ def take_zeros(
             unit = UNITS[name]
             tail = tail_level(values, noise) if impact and n < _FEW else None
             if tail is not None and tail.samples > n:
-                zero = tail
-                note = (
-                    f"The {name} at the end of the record, {engineering(zero.value, unit)}, is "
-                    "taken off as the sensor's offset (the striker has left in the last "
-                    f"{zero.samples} rows)."
-                )
+                zero, left = tail, f"the striker has left in the last {tail.samples} rows"
+                note = f"The {name} at the end of the record, {engineering(zero.value, unit)}, is "
+                note += f"taken off as the sensor's offset ({left})."
             elif n >= _FEWEST:
                 zero, note = _zero_at_rest(name, values[:n], unit, np.ptp(values), noise)
             elif start.first:
-                note = f"Only {n} rows are certainly before contact: the zero of the {name} in the "
-                note += "file is kept."
+                kept = f"the zero of the {name} in the file is kept"
+                note = f"Only {n} rows are certainly before contact: {kept}."
             if zero.samples:
                 steps = _of_steps(values, values[:n])
                 errors[name] = float(np.hypot(zero.error, steps))
@@ -193,11 +190,9 @@ def without_drift(record: Record, start: Start, levels: Levels) -> Record:
         return record
     rest = np.r_[:n, end : len(stress)]
     slope = level_on_line(time[rest], stress[rest], start.time, noise)[1]
-    record = record.noted(
-        f"The stress drifts by {engineering(slope.value * apart, 'Pa')} from before contact to "
-        "after it; this line is taken off."
-    )
-    return record.changed("stress", stress - slope.value * (time - start.time))
+    by = engineering(slope.value * apart, "Pa")
+    note = f"The stress drifts by {by} from before contact to after it; this line is taken off."
+    return record.noted(note).changed("stress", stress - slope.value * (time - start.time))
 
 
 def _zero_at_rest(
@@ -210,16 +205,15 @@ def _zero_at_rest(
     if abs(rise) > max(0.01 * size, 4 * slope.error * n):
         kept = abs(zero.value) <= abs(rise)
         done = "no offset is taken off" if kept else "its zero is as uncertain"
-        drift = engineering(rise, unit)
-        note = f"The {name} drifts by {drift} in the {n} samples before contact, so {done}. "
+        note = f"The {name} drifts by {engineering(rise, unit)} in the {n} samples before contact, "
+        note += f"so {done}. "
         zero = Level(0.0 if kept else zero.value, float(np.hypot(zero.error, rise)), n)
     if zero.value:
         ratio = f", {abs(zero.value) / scatter:.2g} times that" if scatter > 0 else ""
         value, sigma, error = (engineering(v, unit) for v in (zero.value, scatter, zero.error))
-        note += (
-            f"The {name} before contact, {value}, is taken off as the sensor's offset ({n} samples "
-            f"at rest with a standard deviation of {sigma}{ratio}; standard error {error})."
-        )
+        how = f"{n} samples at rest with a standard deviation of {sigma}{ratio}"
+        note += f"The {name} before contact, {value}, is taken off as the sensor's offset ({how}; "
+        note += f"standard error {error})."
     return zero, note.strip()
 
 
@@ -231,8 +225,7 @@ def _zero_of_motion(
     The zero of the file is kept if nothing was recorded before contact, unless it is clearly wrong,
     and in a slow test whose record starts under load.
     """
-    time, values, first = record.instants, record.channel(name), start.first
-    assert values is not None  # the channel exists
+    time, values, first = record.instants, record.curves()[name], start.first
     top = name == "displacement"
     rows = n if n >= _FEWEST else max(0, first - 2)
     if rows >= _FEWEST and (not top or start.gauge == "rest"):
@@ -277,10 +270,8 @@ def mark_flight(record: Record, start: Start, span: Span, levels: Levels) -> Rec
     are then not compared.
     """
     touching = np.arange(len(record)) < span.leaves - span.first
-    inner = {
-        name: record.sampled.get(name, touching) & touching
-        for name in map(interior_channel, record.interior)
-    }
+    inside = map(interior_channel, record.interior)
+    inner = {name: record.sampled.get(name, touching) & touching for name in inside}
     record = replace(record, sampled=record.sampled | inner)
     if record.displacement is None or start.gauge in ("flight", ""):
         return record
@@ -303,23 +294,22 @@ def flight_of(
     flight with its standard error, m/s, or None, and notes.
     """
     n, w, given, notes = start.first - 2, record.displacement, striker.velocity, list[str]()
-    flight = None
     if not given:
-        return striker, flight, notes
+        return striker, None, notes
+    flight = None
     gain = percent(share := GRAVITY * float(record.instants[span.end - 1] - start.time) / given)
     if w is not None and n >= 8:
         noise, t = levels["displacement"], record.instants[:n] - start.time
         gravity, error = (2.0 * half for half in _bend(t, w[:n], noise))
         none = start.gauge == "flight" and 4.0 * error < GRAVITY
         if falls := gravity > 4.0 * error and abs(gravity - GRAVITY) < 0.2 * GRAVITY + 2.0 * error:
-            text = (
-                f"before contact the striker accelerates by {engineering(gravity, 'm/s²')}: it "
-                f"falls, and gains {gain} of its velocity over the contact"
-            )
+            starts, ends = "Before", ". The fit includes gravity."
             if striker.gravity == 0.0:
-                notes.append(f"Check: {text}, but [striker] gravity is false.")
-            else:
-                notes.append(f"{text[0].upper()}{text[1:]}. The fit includes gravity.")
+                starts, ends = "Check: before", ", but [striker] gravity is false."
+            notes.append(
+                f"{starts} contact the striker accelerates by {engineering(gravity, 'm/s²')}: it "
+                f"falls, and gains {gain} of its velocity over the contact{ends}"
+            )
         if striker.gravity is None and (falls or none):
             striker = replace(striker, gravity=GRAVITY if falls else 0.0)
         fall = 0.5 * (striker.gravity or 0.0) * t**2
@@ -329,15 +319,12 @@ def flight_of(
         flight = (float(speed), float(error)) if speed > 0.5 * given else None
         deviation, error = abs(speed - given), float(np.hypot(error, spread))
         if deviation > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:
-            notes.append(
-                f"Check: before contact the displacement moves at {speed:.4g} ± {error:.2g} m/s, "
-                f"{CONTRADICTED} {given:.4g} m/s."
-            )
+            moves = f"the displacement moves at {speed:.4g} ± {error:.2g} m/s"
+            notes.append(f"Check: before contact {moves}, {CONTRADICTED} {given:.4g} m/s.")
     if striker.gravity is None and share > _MATTERS:
-        notes.append(
-            f"Check: a falling striker gains {gain} of its velocity over the contact, but the "
-            f"record {UNKNOWN_FALL}; write gravity = true or false under [striker]."
-        )
+        remedy = "write gravity = true or false under [striker]"
+        gains = f"a falling striker gains {gain} of its velocity over the contact"
+        notes.append(f"Check: {gains}, but the record {UNKNOWN_FALL}; {remedy}.")
     return striker, flight, notes
 
 

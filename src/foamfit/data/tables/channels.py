@@ -1,23 +1,45 @@
-"""Read the channels of a file in SI, and reverse those that are negative in compression."""
+"""Read the channels of a file in SI, and reverse those that are negative in compression.
+
+Signs are judged over the loading. A run is a part of the record in which the motion does not turn.
+The first run in which the force does a considerable part of its work is the loading (or the
+unloading, if the force falls to zero in it). It shows the directions of force and motion in
+compression. Extremes have no influence: adhesion, a spike or rows after the test do little work.
+"""
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from foamfit.arrays import Array, Integers, means
+from foamfit.data.cycles import find_turns
 from foamfit.data.measurement import MIN_ROWS, Dropped, Window
-from foamfit.data.outliers import fresh_samples
-from foamfit.data.tables.columns import Source
+from foamfit.data.noise import integrated_twice, noise_level
+from foamfit.data.outliers import fresh_samples, inner_samples
+from foamfit.data.tables.columns import SOURCES, Source
 from foamfit.data.tables.csv_table import read_numbers, without_cut_row
-from foamfit.data.tables.signs import negative_channels
 from foamfit.data.units import LARGEST
 from foamfit.errors import InputError
 
 _COPIES = 0.9  # share of these that equal it in all channels, above which rows were repeated
 _COARSE = 0.1  # share of rows with the stamp of the row before, from which a clock is coarse
+
+# Signs
+_FIRST = 0.2  # least work (or impulse) of the loading, as a share of the largest one
+_FEW, _NEAR = 9, 0.002  # most samples at an end of a run, and most of its way, with one force
+_UNLOADED = 0.25  # an unloading ends below this share of the force at its start
+_LOADED = 0.1  # share of the mean load that counts as a load
+_ONE_SIDED = 0.5  # most way under the opposite load, as a share of that under load
+_AGREE = 0.5  # least share of the work, over all runs, that has the sign of the loading's
+_PULSE = 0.3  # share of the mean force of a pulse above which it counts
+_NOISE = 8.0  # least size of a pulse in standard deviations of the noise
+_SMOOTHED = 30, 5  # least number of samples for a running median, and its width
 
 
 @dataclass
@@ -36,20 +58,13 @@ class Channels:
     section: str = "columns"
     delay: float = 0.0
 
-    def turn(self, channel: str) -> None:
-        """Reverse the sign of a channel, with a note."""
-        values, name = self.numbers[channel], self.source.name(channel)
-        down = "counts down" if values.min() >= 0.0 else "is negative"
-        self.numbers[channel] = -values
-        self.notes.append(f"The {channel} {name} {down} in compression; its sign is reversed.")
-
     def engineering(self) -> dict[str, Array]:
         """Convert a strain of another measure to engineering strain, with a note."""
         for channel, values in self.numbers.items():
             if measure := self.source.measure(channel):
                 self.numbers[channel] = engineering_strain(measure, values)
-                told = f"The strain is converted from the {measure} strain"
-                self.notes.append(f"{told} {self.source.name(channel)}.")
+                was = f"{measure} strain {self.source.name(channel)}"
+                self.notes.append(f"The strain is converted from the {was}.")
         return self.numbers
 
 
@@ -76,9 +91,8 @@ def read_channels(
     # Some instruments write the number of samples into the header.
     for row, line in enumerate(table.content.split("\n", table.first_row)[: table.first_row], 1):
         match = re.match(r"\W*(?:number of )?samples\W+(\d+)", line, re.IGNORECASE | re.ASCII)
-        if match and int(match[1]) != rows.size:
-            counts = f"{int(match[1])} samples, the table has {rows.size}"
-            notes.append(f"Check: row {row} announces {counts}.")
+        if match and (said := int(match[1])) != rows.size:
+            notes.append(f"Check: row {row} announces {said} samples, the table has {rows.size}.")
             break
     dropped = [*cut, *dropped]
     if "time" in numbers:
@@ -132,23 +146,22 @@ def _evenly(time: Array) -> Array | None:
     places = np.arange(time.size)
     slope, start = np.polyfit(places, time, 1)
     even = start + slope * places
-    steps = np.diff(np.unique(time))
-    return even if np.ptp(time - even) < 1.2 * np.median(steps) else None
+    return even if np.ptp(time - even) < 1.2 * np.median(np.diff(np.unique(time))) else None
 
 
 def check_time(time: Array, name: str, rows: Integers) -> None:
     """Raise InputError unless the time increases from row to row."""
     back = np.flatnonzero(np.diff(time) <= 0)
-    if back.size:
-        i = int(back[0]) + 1
-        wrong, more = "goes back", ""
-        if time[i] == time[i - 1]:
-            more = ' (in a test, [data] duplicates = "average" averages rows with the same stamp)'
-            wrong = "repeats"
-        elif len(back) > len(time) / 2:
-            more = "; as the record runs backwards, reverse the order of its rows"
-        where = f"row {rows[i]}, column {name}"
-        raise InputError(f"{where}: time {wrong}; it must increase from row to row{more}.")
+    if not back.size:
+        return
+    i, wrong, more = int(back[0]) + 1, "goes back", ""
+    if time[i] == time[i - 1]:
+        more = ' (in a test, [data] duplicates = "average" averages rows with the same stamp)'
+        wrong = "repeats"
+    elif len(back) > len(time) / 2:
+        more = "; as the record runs backwards, reverse the order of its rows"
+    where = f"row {rows[i]}, column {name}"
+    raise InputError(f"{where}: time {wrong}; it must increase from row to row{more}.")
 
 
 def turn_negative(parts: list[Channels], window: Window) -> tuple[str, ...]:
@@ -158,18 +171,15 @@ def turn_negative(parts: list[Channels], window: Window) -> tuple[str, ...]:
     if the TOML states this sign, or if the record does not show which channel is wrong.
     """
     owners = {c: part for part in parts for c in part.numbers if c not in ("time", "cycle")}
-    channels, time = (
-        {c: part.numbers[c] for c, part in owners.items()},
-        parts[0].numbers.get("time"),
-    )
+    channels = {c: part.numbers[c] for c, part in owners.items()}
+    time = parts[0].numbers.get("time")
     if time is not None:
-        first = max(window.start, *(part.numbers["time"][0] + part.delay for part in parts))
-        last = min(window.end, *(part.numbers["time"][-1] + part.delay for part in parts))
-        inside = (time >= first) & (time <= last)
-        if inside.sum() < MIN_ROWS:
-            return ()  # refused later
         clocks = {part.section: part.numbers["time"] + part.delay for part in parts}
-        time = time[inside]
+        first = max(window.start, *(clock[0] for clock in clocks.values()))
+        last = min(window.end, *(clock[-1] for clock in clocks.values()))
+        time = time[(time >= first) & (time <= last)]
+        if time.size < MIN_ROWS:
+            return ()  # refused later
         for channel, part in owners.items():
             channels[channel] = np.interp(time, clocks[part.section], channels[channel])
     wrong, certain = negative_channels(channels, time)
@@ -180,10 +190,123 @@ def turn_negative(parts: list[Channels], window: Window) -> tuple[str, ...]:
             f"not show which of them is negative in compression: write {' or '.join(entries)}."
         )
     for channel in wrong:
-        if stated := owners[channel].source.stated_sign(channel):
-            raise InputError(
-                f"the {channel} is negative in compression; it must be positive: leave {stated} "
-                f"out in [{owners[channel].section}]."
-            )
-        owners[channel].turn(channel)
+        part = owners[channel]
+        if stated := part.source.stated_sign(channel):
+            remedy = f"it must be positive: leave {stated} out in [{part.section}]"
+            raise InputError(f"the {channel} is negative in compression; {remedy}.")
+        what = "counts down" if part.numbers[channel].min() >= 0.0 else "is negative"
+        what = f"The {channel} {part.source.name(channel)} {what} in compression"
+        part.notes.append(f"{what}; its sign is reversed.")
+        part.numbers[channel] = -part.numbers[channel]
     return tuple(wrong)
+
+
+def negative_channels(channels: Mapping[str, Array], time: Array | None) -> tuple[list[str], bool]:
+    """Return the channels that are negative in compression, and whether the record proves it.
+
+    The channels have the same rows, but any zero and unit. If force and motion contradict each
+    other and the record does not show which of them is wrong, both are returned.
+    """
+    from scipy.ndimage import median_filter
+
+    force, motion = (next((c for c in names if c in channels), "") for names in SOURCES.values())
+    inner = [inner_samples(channels[c]) for c in (force or motion or "velocity", motion) if c]
+    kept = slice(max(part.start for part in inner), min(part.stop for part in inner))
+    upright = {c: values[kept] for c, values in channels.items()}
+    least, width = _SMOOTHED
+    if kept.stop - kept.start >= least:  # a running median removes single spikes
+        upright = {c: median_filter(v, width, mode="nearest") for c, v in upright.items()}
+    if force and motion:
+        signs = _signs(upright[force], upright[motion])
+        if signs is None:
+            return [force, motion], False
+        wrong = [c for c, sign in zip((force, motion), signs, strict=True) if sign < 0]
+    else:
+        wrong = [force] * bool(force and _pulse_is_negative(upright[force]))
+        wrong += [motion] * bool(motion and _falls(upright[motion]))
+    upright |= {c: -upright[c] for c in wrong}
+    for channel, values in upright.items():
+        other = force if channel in SOURCES["stress"] else motion
+        if other and channel not in (other, "velocity"):
+            opposite = np.dot(values - values.mean(), upright[other] - upright[other].mean()) < 0.0
+            wrong += [channel] * bool(opposite)
+    if time is not None and (velocity := upright.get("velocity")) is not None:
+        if motion:  # whose derivative it is
+            against = np.dot(np.gradient(upright[motion], time[kept]), velocity) < 0.0
+        else:  # its integral rises first
+            against = _falls(integrated_twice(time[kept], velocity)[0])
+        wrong += ["velocity"] * bool(against)
+    return wrong, True
+
+
+def _signs(force: Array, motion: Array) -> tuple[int, int] | None:
+    """Return the signs of force and motion in compression; None if one of them is uncertain.
+
+    Consistent channels remain as they are unless they are negative on one side only.
+    """
+    ends = np.unique([0, *find_turns(motion), motion.size - 1]).tolist()
+    runs = [_Run.of(force[i : j + 1], motion[i : j + 1]) for i, j in pairwise(ends)]
+    most = max((abs(run.work) for run in runs), default=0.0)
+    if most == 0.0:
+        return 1, 1
+    at, run = next((i, run) for i, run in enumerate(runs) if abs(run.work) >= _FIRST * most)
+    same, towards = (1 if run.work > 0.0 else -1), run.towards
+    sign = same * towards
+    if sign > 0 and towards > 0:
+        return 1, 1
+    zero = min(sign * earlier.zero for earlier in runs[: at + 1])  # unloaded
+    load, steps = sign * force - zero, np.abs(np.diff(motion, append=motion[-1]))
+    work = float(np.dot(steps, np.maximum(load, 0.0)))
+    # A mean weighted by the load itself does not depend on motion without load.
+    mean = float(np.dot(steps, np.maximum(load, 0.0) ** 2)) / work if work else 0.0
+    under, against = (float(steps[s * load > _LOADED * mean].sum()) for s in (1, -1))
+    agree = same * sum(run.work for run in runs) >= _AGREE * sum(abs(run.work) for run in runs)
+    if against < _ONE_SIDED * under and agree and zero + mean > 0.0:
+        return sign, towards
+    return (1, 1) if same > 0 else None
+
+
+class _Run(NamedTuple):
+    """A part of the record in which the motion does not turn.
+
+    `zero` is the force of the unloaded specimen, `towards` the direction of the motion in
+    compression, and the work is positive if force and motion have the same one.
+    """
+
+    zero: float
+    towards: int
+    work: float
+
+    @classmethod
+    def of(cls, force: Array, motion: Array) -> _Run:
+        """Judge a run: it is a loading unless the force falls from its peak to zero."""
+        ends = slice(_FEW), slice(-1, -_FEW - 1, -1)
+        near = (np.abs(motion[e] - motion[e][0]) <= _NEAR * np.ptp(motion) for e in ends)
+        start, end = (float(np.median(force[e][n])) for e, n in zip(ends, near, strict=True))
+        way = int(np.sign(motion[-1] - motion[0]))
+        work, other = (float(np.trapezoid(force - zero, motion)) for zero in (start, end))
+        falls = abs(end) < _UNLOADED * abs(start) and abs(start) > 0.5 * float(np.abs(force).max())
+        # A long way without load does no work from the level at that end.
+        least = min(abs(work), abs(other))
+        return cls(*((end, -way) if falls else (start, way)), math.copysign(least, work))
+
+
+def _pulse_is_negative(force: Array) -> bool:
+    """Return whether the first considerable pulse of a force, and most of its impulse, is negative.
+
+    Pulses are parts in which the force differs from its level at the start.
+    """
+    level = force - np.median(force[: max(5, force.size // 200)])
+    size = float(np.dot(level, level)) / max(float(np.abs(level).sum()), 1e-300)
+    sides = np.sign(level) * (np.abs(level) > max(_PULSE * size, _NOISE * noise_level(force)))
+    impulses = np.add.reduceat(np.abs(sides) * level, fresh_samples(sides)[0])
+    considerable = np.abs(impulses) >= _FIRST * np.abs(impulses).max()
+    first, total = impulses[int(np.argmax(considerable))], float(np.abs(impulses).sum())
+    return bool(first < 0.0 and impulses.sum() < -_AGREE * total)
+
+
+def _falls(motion: Array) -> bool:
+    """Return whether a motion without a force falls, turns and rises again."""
+    low = int(np.argmin(motion))
+    fallen, risen = motion[0] - motion[low], motion[: low + 1].max() - motion[0]
+    return bool(low < 0.98 * motion.size and fallen > max(2 * risen, 0.3 * np.ptp(motion)))

@@ -18,7 +18,7 @@ from foamfit.text import listed, percent
 _MOTIONS = "displacement", "strain"
 TWINS = {"stress": "force", "force": "stress", "displacement": "strain", "strain": "displacement"}
 # Channels that stress and displacement are read from, the preferred one first.
-_SOURCES = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIONS}
+SOURCES = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIONS}
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Source:
         """
         names = {column.column for column in given.values()}
         table = find_table(text, names if unclear is None else {*names, 1})
-        return cls(table, assign_columns(table, given, unclear), given)
+        return cls(table, _assigned(table, given, unclear), given)
 
     def factor(self, channel: str) -> float:
         """Return the factor from the numbers of a channel to SI."""
@@ -76,10 +76,8 @@ class Source:
             own = [c for c in self.columns if c in _MOTIONS or interior_node(c)]
             if own:
                 header = table.headers[self.columns[own[0]]].text
-                raise InputError(
-                    f"column {header!r} is a {own[0]}, but [motion] file = {motion.file.name!r} "
-                    "contains the motion; leave one of them out."
-                )
+                wrong = f"column {header!r} is a {own[0]}, but [motion] file = {motion.file.name!r}"
+                raise InputError(f"{wrong} contains the motion; leave one of them out.")
             if "time" not in has:
                 wrong = f"no column is a time (there are {table.listed})"
                 raise InputError(f"{wrong}; with [motion] it needs one like 'time (ms)'.")
@@ -113,10 +111,9 @@ class Source:
         """Return the error for a file without any of the `wanted` channels."""
         entry = "force" if "force" in wanted else wanted[0]
         entries = entries_of(self.table, set(self.columns), entry, *others)
-        return InputError(
-            f"no column is a {' or a '.join(wanted)} (there are {self.table.listed}); name one "
-            f"like '{example(wanted[0])}', or write {entries} in [columns]{more}."
-        )
+        wrong = f"no column is a {' or a '.join(wanted)} (there are {self.table.listed})"
+        remedy = f"name one like '{example(wanted[0])}', or write {entries} in [columns]{more}"
+        return InputError(f"{wrong}; {remedy}.")
 
     def left_out(self) -> dict[str, int]:
         """Return unused columns that duplicate a channel: its twin, or another time."""
@@ -126,29 +123,36 @@ class Source:
             headers = ((k, h.rank(twin)) for k, h in enumerate(self.table.headers))
             ranks = {k: r for k, r in headers if r is not None and k not in self.columns.values()}
             if ranks and (twin not in self.columns or channel == "time"):
-                found[twin] = min(ranks, key=lambda k: ranks[k])
+                found[twin] = min(ranks, key=ranks.__getitem__)
         return found
 
     def scale_spreads(self) -> dict[str, float]:
         """Return the relative standard deviations of the scales of the channels in use."""
-        sources = _SOURCES | {c: (c,) for c in ("velocity", "acceleration")}
-        used = {n: next((c for c in cs if c in self.columns), "") for n, cs in sources.items()}
-        if used["stress"] == "acceleration":  # then acceleration is not a separate channel
-            del used["acceleration"]
-        spreads = {f"{name}_scale": self.entry(c).spread for name, c in used.items()}
-        return {name: spread for name, spread in spreads.items() if spread}
+        used = self._used()
+        names = used | {c: c for c in ("velocity", "acceleration") if c in self.columns}
+        if used.get("stress") == "acceleration":  # then acceleration is not a separate channel
+            del names["acceleration"]
+        return {f"{n}_scale": spread for n, c in names.items() if (spread := self.entry(c).spread)}
+
+    def _used(self) -> dict[str, str]:
+        """Return the channels that stress and displacement are read from."""
+        present = {n: [c for c in cs if c in self.columns] for n, cs in SOURCES.items()}
+        return {name: channels[0] for name, channels in present.items() if channels}
+
+    def _over(self, channel: str) -> bool:
+        """Return whether the scale of a channel is a sensitivity."""
+        given = self.entry(channel)
+        unit = given.unit or self.table.headers[self.columns[channel]].unit or ""
+        return _inverse(given, unit) is not None
+
+    def _located(self, channel: str) -> Entry:
+        """Return the entry of a channel with its column."""
+        return replace(self.entry(channel), column=column_of(self.table, self.columns[channel]))
 
     def entries(self, table: str) -> dict[str, Entry]:
         """Return the entries of a table of the TOML by which stress and displacement are read."""
-        found = dict[str, Entry]()
-        for name, channels in _SOURCES.items():
-            channel = next((c for c in channels if c in self.columns), None)
-            if channel is not None:
-                k, one = self.columns[channel], self.entry(channel)
-                over = _inverse(one, one.unit or self.table.headers[k].unit or "") is not None
-                column = column_of(self.table, k)
-                found[name] = replace(one, column=column, inverse=over, table=table)
-        return found
+        used = {name: (self._located(c), self._over(c)) for name, c in self._used().items()}
+        return {n: replace(one, inverse=over, table=table) for n, (one, over) in used.items()}
 
     def note(self) -> str:
         """Return a note with the column of each channel and the unused columns."""
@@ -158,9 +162,9 @@ class Source:
             unit = given.unit or header.unit or ""
             by = f"{given.scale:.6g} {given.scale_unit}".strip()
             by += f" ± {percent(given.spread)}" if given.spread else ""
-            over = _inverse(given, unit) is not None
+            how = "over the sensitivity" if self._over(channel) else "times"
             part = f"{channel} from {table.name(k)}" + (f" in {given.unit}" if given.unit else "")
-            part += f" {'over the sensitivity' if over else 'times'} {by}" if by != "1" else ""
+            part += f" {how} {by}" if by != "1" else ""
             part += ", counting down" if given.counts_down else ""
             if channel == "force" and unit.casefold() in WEIGHTS:
                 part += f" ({WEIGHTS[unit.casefold()]}: the weight of that mass)"
@@ -171,7 +175,7 @@ class Source:
 
     def sign_entry(self, channel: str) -> Entry:
         """Return the entry of the TOML that reverses the sign of a channel."""
-        given = replace(self.entry(channel), column=column_of(self.table, self.columns[channel]))
+        given = self._located(channel)
         if channel.startswith("displacement"):
             return replace(given, counts_down=True)
         return replace(given, scale=-given.scale)
@@ -183,13 +187,10 @@ class Source:
         return "counts_down = true" if given.counts_down else minus
 
 
-def assign_columns(
-    table: Table, given: dict[str, Entry], unclear: dict[str, list[int]] | None = None
+def _assigned(
+    table: Table, given: dict[str, Entry], unclear: dict[str, list[int]] | None
 ) -> dict[str, int]:
-    """Return the column number of each channel, from [columns] or else from the headers.
-
-    For `unclear` see `Source.of`.
-    """
+    """Return the column number of each channel; see `Source.of`."""
     found: dict[str, int] = {}
     strained = "strain" in given or any(h.rank("strain") is not None for h in table.headers)
     for channel in _channels(table, given):
@@ -211,10 +212,8 @@ def assign_columns(
         if unclear is None:
             both = " and ".join(map(table.name, best))
             entry = Entry(channel, column_of(table, best[0]))
-            raise InputError(
-                f"columns {both} could both be the {channel}; keep one, or write {entry} in "
-                "[columns]."
-            )
+            remedy = f"keep one, or write {entry} in [columns]"
+            raise InputError(f"columns {both} could both be the {channel}; {remedy}.")
         unclear[channel] = best
     # A channel given in the TOML takes precedence over a twin found by its header.
     for named, twin in TWINS.items():
@@ -228,11 +227,18 @@ def assign_columns(
 
 
 def _best(table: Table, channel: str, ranks: dict[int, int]) -> list[int]:
-    """Return the columns that name a channel best."""
     best = [k for k, rank in ranks.items() if rank == min(ranks.values())]
     names = {k: table.headers[k] for k in best}  # "stress" is better than "reference stress"
     best = [k for k in best if not any(names[k].qualifies(names[other]) for other in best)]
-    return _clear_time(table, best) if len(best) > 1 and channel == "time" else best
+    if len(best) < 2 or channel != "time":
+        return best
+    try:  # the only time column that never decreases, if any
+        numbers = read_numbers(table, {str(k): k for k in best})[0]
+    except InputError:  # for example tests of different lengths side by side
+        return best
+    steps = {k: np.diff(numbers[str(k)]) for k in best}
+    rising = [k for k, step in steps.items() if step.size and step.min() >= 0.0 < step.max()]
+    return rising if len(rising) == 1 else best
 
 
 def _channels(table: Table, given: dict[str, Entry]) -> list[str]:
@@ -264,17 +270,6 @@ def column_of(table: Table, k: int) -> str | int:
     return text if unique else k + 1
 
 
-def _clear_time(table: Table, columns: list[int]) -> list[int]:
-    """Reduce several possible time columns to the only one that never decreases, if any."""
-    try:
-        numbers = read_numbers(table, {str(k): k for k in columns})[0]
-    except InputError:  # for example tests of different lengths side by side
-        return columns
-    steps = {k: np.diff(numbers[str(k)]) for k in columns}
-    rising = [k for k, step in steps.items() if step.size and step.min() >= 0.0 < step.max()]
-    return rising if len(rising) == 1 else columns
-
-
 def si_factor(table: Table, channel: str, k: int, given: Entry | None) -> float:
     """Return the factor from the numbers of column `k` to SI."""
     header, given = table.headers[k], given or Entry(channel)
@@ -297,10 +292,8 @@ def si_factor(table: Table, channel: str, k: int, given: Entry | None) -> float:
             over, _, under = given.scale_unit.rpartition("/")
             usual = under if in_si(channel, under) is None else over  # of N/mV or mV/N
         entry = replace(given, column=column_of(table, k), unit=usual)
-        raise InputError(
-            f"{where} has no unit; write it in the header like '{right}' or in [columns] like "
-            f"{entry}."
-        )
+        remedy = f"write it in the header like '{right}' or in [columns] like {entry}"
+        raise InputError(f"{where} has no unit; {remedy}.")
     unit = unit or ""
     if not is_unit(unit, any_case=True):
         raise InputError(f"{where} has an unknown unit {unit!r}; write it like '{right}'.")

@@ -37,6 +37,8 @@ _OF_DAY = re.compile(
     re.IGNORECASE | re.ASCII,
 )
 DAY = 86400.0  # s
+_ONE = "a file must contain one table with one header"
+_NO_THOUSANDS = "write the numbers with a decimal point and without separators"
 
 
 @dataclass(frozen=True)
@@ -139,13 +141,11 @@ def find_table(text: Text, names: set[str | int]) -> Table:
     row = read[separator][i][0]  # a cell may contain line breaks
     above = [k for k, cells in enumerate(grid[:i], 1) if _holds_numbers(cells)]
     if len(above) >= MIN_ROWS:
-        raise InputError(
-            f"rows {above[0]} to {above[-1]} contain numbers above the header in row {row}; a "
-            "file must contain one table with one header."
-        )
+        wrong = f"rows {above[0]} to {above[-1]} contain numbers above the header in row {row}"
+        raise InputError(f"{wrong}; {_ONE}.")
     if (longest := max(map(len, grid[i]))) > LONGEST:
-        wrong = f"row {row}: the name of a column has {longest} characters"
-        raise InputError(f"{wrong}; it must have {LONGEST} at most.")
+        most = f"{longest} characters; it must have {LONGEST} at most"
+        raise InputError(f"row {row}: the name of a column has {most}.")
     first, texts = _unit_row(grid, i)
     body = [cells for cells in grid[first:] if any(cells)]
     if not body:
@@ -200,10 +200,8 @@ def _above_numbers(grids: dict[str, list[list[str]]], names: set[str | int]) -> 
         channels = enumerate(("time", "force", "displacement"), 1)
         entries = ", ".join(str(Entry(c, k, CHANNELS[c].unit)) for k, c in channels)
         shown = ", ".join(grid[rows[0]])[:LONGEST]
-        raise InputError(
-            f"no row names the columns above row {rows[0] + 1}, {shown!r}; give their numbers in "
-            f"[columns], like {entries}."
-        )
+        wrong = f"no row names the columns above row {rows[0] + 1}, {shown!r}"
+        raise InputError(f"{wrong}; give their numbers in [columns], like {entries}.")
     example = "time (ms), stress (MPa), displacement (mm)"
     raise InputError(f"no row names the columns; the first must be like '{example}'.")
 
@@ -241,10 +239,8 @@ def _decimal_sign(body: list[list[str]], width: int, separator: str) -> str:
         return "," if commas else "."
     thousands = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
     if all(thousands.fullmatch(v) for v in commas):
-        raise InputError(
-            f"{commas[0]!r} may have a decimal comma or a thousands separator; "
-            "write the numbers with a decimal point and without separators."
-        )
+        wrong = f"{commas[0]!r} may have a decimal comma or a thousands separator"
+        raise InputError(f"{wrong}; {_NO_THOUSANDS}.")
     points = sum("." in v and _is_number(v) for v in values)
     return "," if len(commas) > points else "."
 
@@ -336,8 +332,7 @@ def _of_header(table: Table, row: int, cells: Sequence[str]) -> list[str]:
     count = len(table.headers)
     out = [" ".join(cell.split()) for cell in cells] + [""] * (count - len(cells))
     if tuple(out) == table.header_cells:
-        again = f"row {row} repeats the header of row {table.header_row}"
-        raise InputError(f"{again}; a file must contain one table with one header.")
+        raise InputError(f"row {row} repeats the header of row {table.header_row}; {_ONE}.")
     if any(out[count:]):
         wrong = f"row {row} has {len(out)} cells, but the header has {count}"
         raise InputError(f"{wrong}; every row must have as many as the header.")
@@ -405,10 +400,8 @@ def _refuse_thousands(table: Table, column: int, values: Array) -> None:
     whole = [cell for cell in cells if re.fullmatch(r"[+-]?[1-9]\d{1,2}", cell)]
     signed = [cell for cell in cells if sign in cell]
     if whole and all(re.fullmatch(rf"[+-]?[1-9]\d{{0,2}}\{sign}\d{{3}}", cell) for cell in signed):
-        raise InputError(
-            f"column {table.name(column)}: {signed[0]!r} with numbers like {whole[-1]!r} seems "
-            "to separate thousands; write the numbers with a decimal point and without separators."
-        )
+        wrong = f"{signed[0]!r} with numbers like {whole[-1]!r} seems to separate thousands"
+        raise InputError(f"column {table.name(column)}: {wrong}; {_NO_THOUSANDS}.")
 
 
 def without_cut_row(table: Table) -> tuple[Table, list[Dropped]]:

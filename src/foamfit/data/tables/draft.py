@@ -17,22 +17,26 @@ from foamfit.errors import InputError, naming
 from foamfit.terminal import printable
 from foamfit.text import listed
 
-# Entries for every test, entries for an impact, and optional entries.
-_NEEDED = (
-    "[specimen]",
-    'height = "10 mm"          # before the test; with its ± if known: "10 ± 0.02 mm"',
-    'diameter = "5 mm"         # or area = "19.6 mm^2"',
-)
-_IMPACT = (
-    "[striker]                 # only for an impact",
-    'mass = "7 g"',
-    'velocity = "1.75 m/s"     # at contact',
-)
-_HELPS = (
-    "[noise]                   # standard deviations; estimated if not given",
-    'stress = "20 kPa"',
-    'displacement = "2 um"',
-)
+_TEMPLATE = """\
+# {file}: the data that foamfit needs for this test.
+# Lines that start with "# " are questions: enter your value and remove the "# ".
+name = {name}
+
+[specimen]
+# height = "10 mm"          # before the test; with its ± if known: "10 ± 0.02 mm"
+# diameter = "5 mm"         # or area = "19.6 mm^2"
+
+[striker]                 # only for an impact
+# mass = "7 g"
+# velocity = "1.75 m/s"     # at contact
+
+[columns]
+{columns}
+
+[noise]                   # standard deviations; estimated if not given
+# stress = "20 kPa"
+# displacement = "2 um"
+"""
 _EVEN = 1.1  # largest ratio of the steps of a clock
 # Groups of channels of which one is needed or useful, each with a question to the user.
 _WANTED = {
@@ -46,31 +50,22 @@ def draft(text: Text) -> tuple[str, list[str]]:
     """Return the text of a TOML with questions after "# ", and the entries still needed."""
     with naming(text.path):
         columns = _columns(text)
-    name = printable(toml_beside(text.path).stem[:LONGEST])
-    head = (
-        f"# {printable(text.path.name)}: the data that foamfit needs for this test.",
-        '# Lines that start with "# " are questions: enter your value and remove the "# ".',
-        f"name = {json.dumps(name, ensure_ascii=False)}",
-    )
-    needed, impact, helps = (
-        (title, *(f"# {line}" for line in lines)) for title, *lines in (_NEEDED, _IMPACT, _HELPS)
-    )
-    parts = [head, needed, impact, ("[columns]", *columns), helps]
+    name = json.dumps(printable(toml_beside(text.path).stem[:LONGEST]), ensure_ascii=False)
+    file = printable(text.path.name)
+    whole = _TEMPLATE.format(file=file, name=name, columns="\n".join(columns))
+    _, *parts = whole.replace("\n# ", "\n").split("\n\n")
+    needed, striker = (part.split("\n") for part in parts[:2])
     missing = [line.removeprefix("# ") for line in columns if "  # needed" in line]
-    asked = [*_NEEDED, *(["[columns]", *missing] if missing else []), *_IMPACT]
-    return "\n\n".join(map("\n".join, parts)) + "\n", asked
+    return whole, [*needed, *(["[columns]", *missing] if missing else []), *striker]
 
 
 def without_toml(toml: Path, text: Text) -> InputError:
     """Return the error for a test without a TOML: its entries, and the command to draft it."""
-    asked = draft(text)[1]
-    keys = [line.partition(" = ")[0] for line in asked[: -len(_IMPACT)] if line[0] != "["]
-    name = text.path.name
-    return InputError(
-        f"{toml}: no such file; {name} needs a TOML with {listed(keys)}, and for an impact the "
-        f"striker's mass and velocity; create it with: foamfit init {text.path}",
-        asked,
-    )
+    asked = draft(text)[1]  # the last three lines are the striker's
+    keys = [line.partition(" = ")[0] for line in asked[:-3] if line[0] != "["]
+    wrong = f"{toml}: no such file; {text.path.name} needs a TOML with {listed(keys)}, and for an "
+    wrong += f"impact the striker's mass and velocity; create it with: foamfit init {text.path}"
+    return InputError(wrong, asked)
 
 
 def _columns(text: Text) -> list[str]:
