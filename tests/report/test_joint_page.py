@@ -15,9 +15,15 @@ from foamfit.fitting.problem import make_problem
 from foamfit.fitting.together import Together
 from foamfit.parts import ParameterEstimate
 from foamfit.report.figures import images
-from foamfit.study.joint_fit import Alternative, fit_jointly
-from foamfit.study.joint_parameters import result_of
-from foamfit.study.joint_result import JointResult, JointTest, joint_page, plot_joint
+from foamfit.study.joint_fit import fit_jointly
+from foamfit.study.joint_result import (
+    Alternative,
+    JointResult,
+    JointTest,
+    joint_page,
+    plot_joint,
+    result_of,
+)
 from foamfit.study.study_file import Study
 
 RATES = (0.01, 0.1, 1.0)

@@ -169,7 +169,8 @@ def look(
     reached, broken = np.zeros((d, k), dtype=bool), np.ones(d, dtype=bool)
     missed, forces, apart = np.zeros(d), list[float](), dict[str, list[float]]()
     usual = max(known.share.values(), default=0.0)  # of curves that no test at hand has
-    others = {name: Rival.of(one, candidate, rig, each) for name, one in (rivals or {}).items()}
+    made = {name: Rival.of(one, candidate, rig, each) for name, one in (rivals or {}).items()}
+    others = {name: rival for name, rival in made.items() if rival is not None}
     for i, drawn in enumerate(known.draws):
         values = known.with_springs(drawn, problem)
         try:
@@ -193,9 +194,8 @@ def look(
             off = share * float(np.ptp(shown.curves[curve]))
             missed[i] += each * size * (off * objective.factor(curve)) ** 2
         for name, rival in others.items():
-            if rival is not None:
-                found = rival.excess(objective.compare(shown, values)) / (1.0 + missed[i])
-                apart.setdefault(name, []).append(found)
+            found = rival.excess(objective.compare(shown, values)) / (1.0 + missed[i])
+            apart.setdefault(name, []).append(found)
     told = {name: float(np.median(found)) for name, found in apart.items()}
     force = float(np.median(forces)) if forces else math.nan
     return Seen(bread, meat, reached, broken, missed, force, told)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -212,12 +213,10 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
         raise InputError(
             f"{error}; {source.name} was fitted with this drive, choose another by --drive (drive=)"
         ) from None
-    inside, shift = source.interior_mass and chosen == "impact", source.time_shift
-    if shift:
-        try:
-            check_time_shift(measurement, chosen)
-        except InputError:  # this record cannot have the time shift of the fitted one
-            shift = False
+    inside, shift = source.interior_mass and chosen == "impact", False
+    with suppress(InputError):  # if this record cannot have the time shift of the fitted one
+        check_time_shift(measurement, chosen)
+        shift = source.time_shift
     law, terms = source.model.name, source.model.relaxation
     problem = make_problem(
         measurement, law, chosen, None, None, inside, time_shift=shift, relaxation=terms

@@ -11,18 +11,8 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from foamfit.data.toml_file import (
-    COUNT,
-    FLAG,
-    RANGE,
-    Check,
-    Rule,
-    anything,
-    checked,
-    load_toml,
-    motion_file,
-    table_of,
-)
+from foamfit.data import toml_file
+from foamfit.data.toml_file import Check, Rule, checked, motion_file, table_of
 from foamfit.errors import InputError, naming
 from foamfit.fitting.links import KINDS
 from foamfit.options import FREED, OF_FIT
@@ -48,11 +38,11 @@ _KEYS: dict[str, Check] = {
     "tests": _PATTERNS,
     "model": _text('model = "microscale"'),
     "specimen": _text('specimen = "foam.toml"'),
-    "cycle": COUNT,
-    "cycles": RANGE,
+    "cycle": toml_file.COUNT,
+    "cycles": toml_file.RANGE,
     **{n: Rule(OF_FIT[n].admits, OF_FIT[n].right) for n in ("drive", "seed", "starts")},
-    **dict.fromkeys(FREED, FLAG),
-    **dict.fromkeys(("relaxation", "specimens", "parameters"), anything),
+    **dict.fromkeys(FREED, toml_file.FLAG),
+    **dict.fromkeys(("relaxation", "specimens", "parameters"), toml_file.anything),
 }
 
 
@@ -81,7 +71,7 @@ class Study:
 def read_study(path: str | Path) -> Study:
     """Read and check a study file; InputError names the file and the wrong or missing key."""
     path = Path(path)
-    content = load_toml(path, "a study is a TOML with tests, model and [parameters]")
+    content = toml_file.load_toml(path, "a study is a TOML with tests, model and [parameters]")
     found = checked(content, _KEYS, f"{path}:", ["tests", "model"])
     with naming(path):
         if {"cycle", "cycles"} <= content.keys():
