@@ -313,10 +313,8 @@ def _search(
 ) -> tuple[Problem, SearchRecord]:
     """Search and refine; return the problem, and the record with costs and reason of a stop.
 
-    The search begins from points already `known`, if there are any.
-
-    Along a given motion, contact and zeros are fitted after the search only: the first rise shows
-    them to a fraction of a sample.
+    The search begins from points already `known`, if there are any. Along a given motion, contact
+    and zeros are fitted after it only: the first rise shows them to a fraction of a sample.
     """
     rng, early = np.random.default_rng(record.seed), list[Array]()
     thinned, impact = problem.thinned(), problem.objective.drive == "impact"

@@ -72,9 +72,9 @@ class CycleFits(Result):
     def rows(self) -> Iterator[dict[str, Any]]:
         """Yield the rows of cycles.csv in SI, one per cycle; None for missing values."""
         every = {n: self.results.get(n) for n in sorted({*self.results, *self.refused})}
-        parameters = wide([{} if one is None else one.parameters for one in every.values()])
-        names = ["start_strain", "peak_strain", "peak_stress", ENERGY]
-        names += [f"misfit_{name}" for name in CURVES]
+        parameters = wide([one.parameters if one else {} for one in every.values()])
+        misfits = (f"misfit_{name}" for name in CURVES)
+        names = ["start_strain", "peak_strain", "peak_stress", ENERGY, *misfits]
         for (number, one), own in zip(every.items(), parameters, strict=True):
             cells: list[Any] = [None] * len(names)
             status = "refused"
@@ -189,10 +189,9 @@ def fit_cycles(
     if not wanted:
         raise InputError("no cycle is given; give at least one, or omit cycles to fit all")
     results, refused = dict[int, Fit](), dict[int, str]()
-    stopped = None
+    stopped, count = None, len(wanted)
     for i, number in enumerate(wanted):
-        begin, end = i / len(wanted), (i + 1) / len(wanted)
-        notify = part_of(report, begin, end, f"cycle {number}: ")
+        notify = part_of(report, i / count, (i + 1) / count, f"cycle {number}: ")
         try:
             test = first if number == first.cycle else read_test(path, specimen, number)
             results[number] = fit(test, model=model, progress=notify, tell=tell, **options)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -22,7 +22,7 @@ from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.branches import unreached
 from foamfit.fitting.problem import Problem, make_params, make_problem
-from foamfit.report.studies.plan import Expected, Quantity
+from foamfit.report.studies.plan import Expected
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Impact
 from foamfit.springs.parameters import NUISANCE
@@ -65,11 +65,6 @@ class Known:
     def drawn_sizes(self) -> Array:
         """Scale of each parameter in each draw over `sizes`, (d, k)."""
         return np.array([self.problem.sizes(self.names, one) for one in self.draws]) / self.sizes
-
-    def first(self, count: int) -> Known:
-        """Return the same with the first draws only."""
-        few = {name: getattr(self, name)[:count] for name in ("draws", "bread", "meat")}
-        return replace(self, **few)
 
     def with_springs(self, drawn: Array, problem: Problem) -> Array:
         """Return the parameters of another test: drawn springs, and its nuisance parameters."""
@@ -121,8 +116,7 @@ def problem_for(
     With `with_motion` the motion counts even if the rig does not record it.
     """
     problem, test = known.problem, known.problem.measurement
-    lasts, peak = 0.0, problem.scales.stress
-    impact = candidate.drive == "impact"
+    lasts, peak, impact = 0.0, problem.scales.stress, candidate.drive == "impact"
     if impact:
         lasts, peak = _duration_and_peak(known, candidate, peak)
     record = candidate.recorded(test, rig, lasts, peak, with_motion=with_motion)
@@ -360,7 +354,3 @@ class Target:
     def middle(self) -> float:
         """Median of the quantity over the draws, SI."""
         return float(np.nanmedian(self.values))
-
-    def shown(self, known: Known) -> Quantity:
-        """Return the quantity as it is known now."""
-        return Quantity(self.text, self.unit, self.middle, self.error(known, []))

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median_low
-from typing import NamedTuple
 
 import lmfit
 import numpy as np
@@ -48,13 +47,21 @@ SAME_RATE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class _Test:
-    """One test of a study, ready to be fitted."""
+    """One test of a study, and its fit by itself."""
 
     name: str
     file: Path
     problem: Problem
     params: lmfit.Parameters  # Before any fit
     rate: float | None  # 1/s
+    values: Array = field(default_factory=lambda: np.empty(0))  # Parameters of the fit, SI
+    cost: float = math.nan  # χ² per sample
+
+    def fitted(self, problem: Problem, tracker: Tracker, values: Array) -> _Test:
+        """Return it with the result of a search or a descent, whose evaluations do not count."""
+        objective = replace(problem.objective, spent=Spent())
+        problem, cost = replace(problem, objective=objective), tracker.best_cost / objective.n_data
+        return replace(self, problem=problem, values=values, cost=cost)
 
 
 @single_threaded
@@ -107,12 +114,12 @@ def joint(
     tell(0.5, "together")
     auto = [name for name, kind in study.kinds.items() if kind == AUTO and name in alone.own]
     if auto:
-        links = choose_kinds(alone.problems, links, auto, starts, alone.n_eff, kinds)
+        links = choose_kinds(alone, links, auto, starts, kinds)
     fit = fit_jointly(alone.problems, links, starts)
     tell(0.9, "evidence")
     every = (*fit.found.shared, *fit.found.own)
     compared = [name for name in every if links.kind(name) in RATES or name in auto]
-    tried, slopes = evidence(fit.found, compared, alone.n_eff, kinds, [alone.values])
+    tried, slopes = evidence(fit.found, compared, kinds, alone)
     files, rate0 = {test.name: test.file for test in tests}, _median_rate(rates)
     about = {"evidence": tried, "refused": refused, "runtime_s": time.perf_counter() - began}
     result = result_of(study, files, rates, rate0, fit, alone, slopes, **about)
@@ -160,10 +167,7 @@ def _check_two(study: Study, count: int, refused: Mapping[str, str]) -> None:
 
 
 def _params(study: Study, tests: Sequence[Measurement]) -> list[lmfit.Parameters]:
-    """Return the parameters of each test.
-
-    A named parameter varies in the tests in which it varies by default, or else in all tests.
-    """
+    """Return the parameters; a named one varies where it does by default, or else in all tests."""
     model = Model.parse(study.model, study.relaxation)
     drives = [study.drive or choose_drive(test, study.kinds) for test in tests]
     every = [make_params(test, model, by) for test, by in zip(tests, drives, strict=True)]
@@ -230,7 +234,7 @@ def _own_fits(
     order = sorted(range(len(tests)), key=lambda t: (tests[t].rate or 0.0, t))
     places = np.unique(np.linspace(0, len(order) - 1, min(SEARCHED, len(order))).astype(int))
     first = [order[place] for place in places]
-    found = dict[int, _Own]()
+    found = dict[int, _Test]()
 
     def do(chosen: Sequence[int], near: tuple[Array, ...], done: float) -> None:
         for i, t in enumerate(chosen):
@@ -246,40 +250,23 @@ def _own_fits(
     do([t for t in order if t not in first], near, 0.3)
     do([t for t in order if t not in first and t in found and found[t].cost > FAR * worst], (), 0.3)
     _check_two(study, len(found), refused)
-    kept = list[_Test]()
-    for t, fitted in sorted(found.items()):
-        problem, test = fitted.problem, replace(tests[t], problem=fitted.problem)
-        if problem.objective.drive == "impact" and test.rate is not None:
+    kept = [found[t] for t in sorted(found)]
+    for t, test in enumerate(kept):
+        objective, measurement = test.problem.objective, test.problem.measurement
+        if objective.drive == "impact" and test.rate is not None:
             # The rate of the fitted motion, which has no noise.
-            simulated = problem.objective.simulate(fitted.values, everything=True)
-            rate = loading_rate(problem.measurement, simulated.curves["displacement_time"])
-            test = replace(test, rate=rate)
-        kept.append(test)
-    vectors = [fitted.values for _, fitted in sorted(found.items())]
-    return kept, Together.of_own_fits([test.problem for test in kept], vectors)
+            motion = objective.simulate(test.values, everything=True).curves["displacement_time"]
+            kept[t] = replace(test, rate=loading_rate(measurement, motion))
+    problems, values = [test.problem for test in kept], [test.values for test in kept]
+    return kept, Together.of_own_fits(problems, values)
 
 
-class _Own(NamedTuple):
-    """The fit of one test by itself."""
-
-    problem: Problem
-    values: Array  # Parameters, SI
-    cost: float  # χ² per sample
-
-    @classmethod
-    def of(cls, problem: Problem, tracker: Tracker, values: Array) -> _Own:
-        """Return the result of a search or a descent; the joint fit counts its own evaluations."""
-        objective = replace(problem.objective, spent=Spent())
-        cost = tracker.best_cost / objective.n_data
-        return cls(replace(problem, objective=objective), values, cost)
-
-
-def _own_fit(test: _Test, model: str, options: Options, near: tuple[Array, ...]) -> _Own:
+def _own_fit(test: _Test, model: str, options: Options, near: tuple[Array, ...]) -> _Test:
     """Fit one test, starting from the points `near` it or else by a search."""
     measurement, params = test.problem.measurement, test.params
     if not near:
         found = identify(measurement, model, params, options, lambda *_: None)
-        return _Own.of(found.problem, found.tracker, found.best().values)
+        return test.fitted(found.problem, found.tracker, found.best().values)
     problem = options.problem(measurement, model, params)
     space, tracker = problem.space(), Tracker(problem.objective)
     for start in near:
@@ -289,11 +276,11 @@ def _own_fit(test: _Test, model: str, options: Options, near: tuple[Array, ...])
         return _own_fit(test, model, options, ())
     problem, _ = keep_to_record(problem, tracker, options.vary)
     weigh_motion(problem, tracker)
-    return _Own.of(problem, tracker, tracker.best_values)
+    return test.fitted(problem, tracker, tracker.best_values)
 
 
 def evidence(
-    fit: Together, names: Sequence[str], n_eff: int, kinds: Sequence[str], near: Sequence[Vectors]
+    fit: Together, names: Sequence[str], kinds: Sequence[str], alone: Together
 ) -> tuple[tuple[Alternative, ...], dict[str, float]]:
     """Compare these kinds of each of these parameters, leaving the other parameters as they are.
 
@@ -301,32 +288,28 @@ def evidence(
     """
     found, wide = list[Alternative](), dict[str, float]()
     for name in names:
-        present = fit.links.kind(name)
-        for kind, other in _kinds_of(fit, name, (present, *kinds), [fit.values, *near], wide):
-            bic = other.bic(n_eff)
+        present, near = fit.links.kind(name), [fit.values, alone.values]
+        for kind, other in _kinds_of(fit, name, (present, *kinds), near, wide):
+            bic = other.bic(alone.n_eff)
             found.append(Alternative(name, kind, kind == present, bic, other.n_vary, other.cost))
     return tuple(found), wide
 
 
 def choose_kinds(
-    problems: Sequence[Problem],
-    links: Links,
-    names: Sequence[str],
-    starts: Sequence[Vectors],
-    n_eff: int,
-    kinds: Sequence[str],
+    alone: Together, links: Links, names: list[str], starts: Sequence[Vectors], kinds: list[str]
 ) -> Links:
     """Return links in which these parameters have the kinds of least BIC.
 
     All are shared at first; each round makes the change of one kind that lowers BIC most. A rate
     law is not tried if the tests do not determine its slope (`open_slope`).
     """
-    now = fit_linked(problems, links.having(**dict.fromkeys(names, "shared")), starts)
+    now = fit_linked(alone.problems, links.having(**dict.fromkeys(names, "shared")), starts)
+    n_eff = alone.n_eff
     while True:
         trials = [
             fit
             for name in names
-            for kind, fit in _kinds_of(now, name, kinds, [now.values, *starts[:1]], {})
+            for kind, fit in _kinds_of(now, name, kinds, [now.values, alone.values], {})
             if kind != now.links.kind(name)
         ]
         best = min(trials, key=lambda fit: fit.bic(n_eff), default=now)

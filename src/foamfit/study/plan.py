@@ -30,7 +30,7 @@ from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.one_model import Progress
 from foamfit.parts import rung_name
-from foamfit.report.studies.plan import RISKY, Expected, Outcome, Plan
+from foamfit.report.studies.plan import RISKY, Expected, Outcome, Plan, Quantity
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.parameters import NUISANCE
@@ -147,7 +147,9 @@ def plan(
         pair=pair and (outcome(asked[pair[0]], *(seen[i] for i in pair)), asked[pair[1]]),
         never=never,
         closing={mass: _closing(known, mass, limits) for mass in limits.masses},
-        quantity=None if target is None else target.shown(known),
+        quantity=None
+        if target is None
+        else Quantity(target.text, target.unit, target.middle, target.error(known, [])),
         rivals=tuple(others),
         missed=known.missed > 0.0,
         contradicted=contradicted,
@@ -434,7 +436,8 @@ def _beyond(known: Known, left: Sequence[str], rig: Rig, *, impacts: bool) -> di
     """Return, for parameters that no test of the rig determines, what other rig would."""
     problem, out = known.problem, dict.fromkeys(left, "")
     test, springs = problem.measurement, len(problem.model.kinds)
-    few = known.first(DRAWS // 4)
+    fewer = {n: getattr(known, n)[: DRAWS // 4] for n in ("draws", "bread", "meat")}
+    few = replace(known, **fewer)
     for what, other in beyond(rig, springs) if left else ():
         made = [one for one in candidates(other, test, springs) if not one.repeat]
         made = [one for one in made if impacts or one.drive != "impact"]

@@ -263,10 +263,7 @@ def _point(population: Population, problem: Problem) -> Array:
 def _aligned(
     problem: Problem, springs: Array, scattering: tuple[str, ...]
 ) -> tuple[Array, dict[str, float]]:
-    """Fit the nuisance parameters of the record.
-
-    Returns all parameters, and the fitted ones with the zeros of the record's file.
-    """
+    """Return all parameters, and the fitted nuisance parameters with the zeros of the file."""
     # Scattering parameters are fitted too and then discarded: if they were fixed, a stiffer
     # specimen would be mistaken for an earlier contact.
     params = problem.params.copy()
@@ -294,10 +291,7 @@ def _aligned(
 def _draw(
     population: Population, problem: Problem, point: Array, draws: int, seed: int
 ) -> tuple[list[Array], list[dict[str, Array]], int]:
-    """Draw and simulate specimens.
-
-    Returns their parameters and curves, and the number of additional draws that failed.
-    """
+    """Return parameters and curves of drawn specimens, and the number of draws that failed."""
     # Parameters outside the limits of a fit are clipped, as in a fit. Drawing them again would
     # distort the distribution of the other parameters.
     objective, specimens, tried = problem.objective, population.draws(seed), 0
