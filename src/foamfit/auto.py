@@ -340,8 +340,8 @@ def _conclude(state: _Comparison) -> Fit:
     told |= {"blocks": BLOCKS, "share": SHARE, "bent": BENT, "margin": MARGIN}
     sound = [i for i, one in enumerate(tried) if not one.states("not determined")]
     if told["lost"] and sound:
-        costs = [tried[i].misfit if decision.by_prediction else criteria[i].bic for i in sound]
-        nearest = sound[int(np.argmin(costs))]
+        by_misfit = decision.by_prediction
+        nearest = min(sound, key=lambda i: tried[i].misfit if by_misfit else criteria[i].bic)
         higher = criteria[nearest].bic - criteria[decision.best].bic
         told |= {"sound": tried[nearest], "higher": higher}
     if result.at_noise is False and not any(one.structureless for one in tried):

@@ -68,9 +68,8 @@ def found(tmp_path_factory) -> JointResult:
         Alternative("s1_sigma_plus", "own", False, 14.0, 14, 299.0),
     )
     files, alone = dict.fromkeys(names, here), Together.of_own_fits(problems, vectors)
-    made = result_of(
-        study, files, RATES, 0.1, fit, alone, {}, evidence=evidence, refused={}, runtime_s=1.0
-    )
+    about = {"rate0": 0.1, "evidence": evidence, "refused": {}, "runtime_s": 1.0}
+    made = result_of(study, files, RATES, fit, alone, {}, **about)
     words = {"warnings": ("x.csv is left out: it holds <nothing>.",), "sentences": ("Said.",)}
     return replace(made, status="warnings", **words)
 

@@ -157,8 +157,12 @@ class Batch:
             rows = future.result()
         except (futures.BrokenExecutor, futures.CancelledError, InputError):
             raise  # the result cannot be written, or no other test can be fitted
-        except Exception as error:
-            rows = task.refused(_lost(error))
+        except Exception as error:  # its cause may lie outside the test
+            kind = type(error).__name__
+            why = f"its fit was lost ({kind}: {error})"
+            if isinstance(error, EndedError) or kind == "KilledWorker":  # raised by Dask
+                why = "its process ended before it was fitted (killed, or out of memory)"
+            rows = task.refused(f"{why}; call again to retry")
         else:
             self.fitted += 1
         self._keep(task.name, rows)
@@ -308,21 +312,8 @@ def _check_out(out: Path) -> None:
 
 
 def _processes(recipe: Recipe, jobs: int | None, tests: int) -> Processes:
-    """Return processes of this machine."""
     precompile.compile_solver(recipe.model)
     return Processes(min(jobs or cores(), tests), (*FITS, *(PAGES if recipe.pages else ())))
-
-
-def _lost(error: Exception) -> str:
-    """Return why a test has no result if the cause may lie outside the test."""
-    if isinstance(error, EndedError) or type(error).__name__ == "KilledWorker":  # raised by Dask
-        return (
-            "its process ended before it was fitted (killed, or out of memory); call again to retry"
-        )
-    return f"its fit was lost ({type(error).__name__}: {error}); call again to retry"
-
-
-# ---------------------------------------------------------------- the work on one test
 
 
 @dataclass(frozen=True)
@@ -419,7 +410,6 @@ def work(task: Task) -> tuple[Row, ...]:
 
 
 def _written(task: Task) -> tuple[Row, ...]:
-    """Fit one test, write its folder and return its rows."""
     write: Callable[[Path], None] = lambda _: None  # noqa: E731
     try:
         rows, write = _results(task)

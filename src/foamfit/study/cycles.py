@@ -20,7 +20,6 @@ from foamfit.one_model import Options, Progress, part_of
 from foamfit.options import Keywords
 from foamfit.parts import ParameterEstimate
 from foamfit.report import figures
-from foamfit.report.figures import TWO
 from foamfit.report.folder import write_json, write_result, write_table, write_text
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import own_name
@@ -210,7 +209,7 @@ def fit_cycles(
     return CycleFits(first.name, model, first.cycles, results, refused, *made)
 
 
-def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
+def plot_cycles(found: CycleFits, *, width: str = figures.TWO) -> Figure:
     """Draw all loops in one panel, and start strain, energy, misfit and parameters by cycle.
 
     For the parameters see `plot_parameters`. At most `MOST_LOOPS` loops are drawn.

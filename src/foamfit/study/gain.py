@@ -10,7 +10,7 @@ factor by which the ranges of the tests at hand exceed this.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -163,8 +163,8 @@ def look(
     reached, broken = np.zeros((d, k), dtype=bool), np.ones(d, dtype=bool)
     missed, forces, apart = np.zeros(d), list[float](), dict[str, list[float]]()
     usual = max(known.share.values(), default=0.0)  # of curves that no test at hand has
-    made = {name: Rival.of(one, candidate, rig, each) for name, one in (rivals or {}).items()}
-    others = {name: rival for name, rival in made.items() if rival is not None}
+    made = {n: _excess_over(one, candidate, rig, each) for n, one in (rivals or {}).items()}
+    others = {name: excess for name, excess in made.items() if excess is not None}
     for i, drawn in enumerate(known.draws):
         values = known.with_springs(drawn, problem)
         try:
@@ -187,48 +187,42 @@ def look(
             share = known.share.get(curve, usual)
             off = share * float(np.ptp(shown.curves[curve]))
             missed[i] += each * size * (off * objective.factor(curve)) ** 2
-        for name, rival in others.items():
-            found = rival.excess(objective.compare(shown, values)) / (1.0 + missed[i])
+        for name, excess in others.items():
+            found = excess(objective.compare(shown, values)) / (1.0 + missed[i])
             apart.setdefault(name, []).append(found)
     told = {name: float(np.median(found)) for name, found in apart.items()}
     force = float(np.median(forces)) if forces else math.nan
     return Seen(bread, meat, reached, broken, missed, force, told)
 
 
-@dataclass(frozen=True, eq=False)
-class Rival:
-    """Another law at its best point for a candidate."""
+def _excess_over(
+    known: Known, candidate: Candidate, rig: Rig, weight: float
+) -> Callable[[Array], float] | None:
+    """Return the χ² of residuals that remains after a fit of another law, to first order.
 
-    residual: Array  # of its curves against the same placeholders
-    rows: Array  # slopes by all its parameters; below them the information on these
-    weight: float
+    The law is simulated at its best point for a candidate; None if it cannot be.
+    """
+    k = len(known.names)
+    try:
+        problem = problem_for(known, candidate, rig)
+        values = known.with_springs(known.values, problem)
+        shown = problem.objective.simulate(values)
+    except SimulationError:
+        return None
+    n = problem.objective.n_data
+    rows = math.sqrt(weight) * rows_of(problem, values, known.names, known.sizes)[:n]
+    root = np.linalg.cholesky(known.bread[0] + TINY * np.eye(k)).T
+    rows = np.vstack([rows, np.hstack([np.zeros((k, rows.shape[1] - k)), root])])
+    own = problem.objective.compare(shown, values)[:n]
 
-    @classmethod
-    def of(cls, known: Known, candidate: Candidate, rig: Rig, each: float) -> Rival | None:
-        """Return the rival; None if it cannot be simulated."""
-        k = len(known.names)
-        try:
-            problem = problem_for(known, candidate, rig)
-            values = known.with_springs(known.values, problem)
-            shown = problem.objective.simulate(values)
-        except SimulationError:
-            return None
-        n = problem.objective.n_data
-        rows = rows_of(problem, values, known.names, known.sizes)[:n]
-        root = np.linalg.cholesky(known.bread[0] + TINY * np.eye(k)).T
-        prior = np.hstack([np.zeros((k, rows.shape[1] - k)), root])
-        residual = problem.objective.compare(shown, values)[:n]
-        return cls(residual, np.vstack([math.sqrt(each) * rows, prior]), each)
-
-    def excess(self, residual: Array) -> float:
-        """Return the χ² that remains when the rival is fitted to the curves, to first order."""
-        n = self.residual.size
+    def excess(residual: Array) -> float:
         if residual.size < n:
             return 0.0
-        apart = math.sqrt(self.weight) * (residual[:n] - self.residual)
-        apart = np.append(apart, np.zeros(len(self.rows) - n))
-        left = apart - self.rows @ np.linalg.lstsq(self.rows, apart, rcond=1e-10)[0]
+        apart = np.append(math.sqrt(weight) * (residual[:n] - own), np.zeros(k))
+        left = apart - rows @ np.linalg.lstsq(rows, apart, rcond=1e-10)[0]
         return float(left @ left)
+
+    return excess
 
 
 def covariance(known: Known, seen: Sequence[Seen], floor: float = TINY) -> tuple[Array, Array]:

@@ -120,9 +120,9 @@ def joint(
     every = (*fit.found.shared, *fit.found.own)
     compared = [name for name in every if links.kind(name) in RATES or name in auto]
     tried, slopes = evidence(fit.found, compared, kinds, alone)
-    files, rate0 = {test.name: test.file for test in tests}, _median_rate(rates)
-    about = {"evidence": tried, "refused": refused, "runtime_s": time.perf_counter() - began}
-    result = result_of(study, files, rates, rate0, fit, alone, slopes, **about)
+    files, took = {test.name: test.file for test in tests}, time.perf_counter() - began
+    about = {"evidence": tried, "refused": refused, "runtime_s": took, "rate0": _median_rate(rates)}
+    result = result_of(study, files, rates, fit, alone, slopes, **about)
     tell(1.0, "done")
     if out is not None:
         result.save(out, report=report)

@@ -166,11 +166,11 @@ def ranges_of(point: JointPoint) -> dict[str, Ends]:
     if not point.uncertainty.errs:
         return {}
     out = _over_specimens(point.found)
-    shared = [name for name in point.found.shared if point.found.links.kind(name) == "shared"]
-    for name in shared:
-        held = [_held(point, name, sign) for sign in (-1.0, 1.0)]
-        ends = [*held, point.found.common[name][0], *out.get(name, ())]
-        out[name] = min(ends), max(ends)
+    for name in point.found.shared:
+        if point.found.links.kind(name) == "shared":
+            held = (_held(point, name, sign) for sign in (-1.0, 1.0))
+            ends = [*held, point.found.common[name][0], *out.get(name, ())]
+            out[name] = min(ends), max(ends)
     return out
 
 
@@ -185,7 +185,6 @@ def own_ranges(point: JointPoint, ranges: Mapping[str, Ends]) -> tuple[dict[str,
     for best in point.bests:
         problem, values = best.problem, best.values
         shared = [name for name in best.names if name in point.found.shared]
-        shared = [name for name in shared if point.found.links.kind(name) != "scatter"]
         for name in shared:
             problem = problem.holding(name, best.value(name))
         alone = BestPoint(problem, values)
@@ -206,8 +205,8 @@ def own_ranges(point: JointPoint, ranges: Mapping[str, Ends]) -> tuple[dict[str,
 def _over_specimens(found: Together) -> dict[str, Ends]:
     """Return ranges of shared values and slopes from fits without each group of tests."""
     count = len(found.problems)
-    groups = [range(first, count, GROUPS) for first in range(min(count, GROUPS))]
-    kept = [[t for t in range(count) if t not in group] for group in groups]
+    groups = range(min(count, GROUPS))
+    kept = [[t for t in range(count) if t % GROUPS != group] for group in groups]
     others = [common for one in kept if (common := _without(found, one))]
     if len(others) < 2:
         return {}

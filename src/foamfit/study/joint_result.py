@@ -24,7 +24,6 @@ from foamfit.fitting.search import SearchRecord
 from foamfit.fitting.together import Together
 from foamfit.parts import OfLaw, ParameterEstimate
 from foamfit.report import figures
-from foamfit.report.figures import TWO
 from foamfit.report.folder import write_json, write_result, write_text
 from foamfit.report.listing import Row, table_of
 from foamfit.report.plots import draw_loops
@@ -142,6 +141,11 @@ class JointResult(Result, OfLaw):
         every = self.parameters.items()
         return {n: p for n, p in every if n not in NUISANCE and (p.kind != "fixed" or p.value)}
 
+    def of_test(self, test: str) -> dict[str, ParameterEstimate]:
+        """Return the parameters that may differ between tests, in one of them."""
+        every = self.parameters.items()
+        return {name: one.in_test(test) for name, one in every if test in (one.tests or {})}
+
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the loops of all tests, measured and fitted, into axes or a new figure."""
         return draw_loops(self.loops, ax)
@@ -156,10 +160,9 @@ class JointResult(Result, OfLaw):
         columns = {key: {n: getattr(p, key) for n, p in common.items()} for key in more}
         frames = {"": frame(common, **columns)}
         for test in self.tests:
-            own = {n: p for n, p in self.parameters.items() if p.tests and test in p.tests}
-            kinds = {name: p.kind for name, p in own.items()}
-            each = {name: p.in_test(test) for name, p in own.items()}
-            frames[test] = frame(each, kind=kinds, scatter={}, b={})
+            own = self.of_test(test)
+            kinds = {name: self.parameters[name].kind for name in own}
+            frames[test] = frame(own, kind=kinds, scatter={}, b={})
         return stacked(frames, "test")
 
     def __repr__(self) -> str:
@@ -176,7 +179,7 @@ class JointResult(Result, OfLaw):
         more: Any = {"parameters": every, "nuisance": NUISANCE, "between": _between}
         return words("joint", found=self, most=MOST_ROWS, curves=curves, readable=readable, **more)
 
-    def write(self, folder: Path, *, pages: bool = True, width: str = TWO) -> None:
+    def write(self, folder: Path, *, pages: bool = True, width: str = figures.TWO) -> None:
         """Write joint.json, its page, its figure, table.tex, and a result folder per test."""
         write_json(folder / "joint.json", self.to_json_dict())
         shown = self.of_springs
@@ -207,14 +210,8 @@ def _between(one: ParameterEstimate) -> str:
 
 def joint_page(found: JointResult, folder: Path, figure: bytes) -> str:
     """Return the page in a folder, with its figure (SVG)."""
-    varied = {n: p.tests for n, p in found.parameters.items() if p.kind != "fixed" and p.tests}
     rows = [
-        Row(
-            test,
-            misfit=own.misfit,
-            parameters={n: found.parameters[n].in_test(test) for n in varied if test in varied[n]},
-            more=_more(found, own),
-        )
+        Row(test, misfit=own.misfit, parameters=found.of_test(test), more=_more(found, own))
         for test, own in found.tests.items()
     ]
     shown = [(one, readable(name, one), _between(one)) for name, one in found.of_springs.items()]
@@ -228,16 +225,15 @@ def _more(found: JointResult, own: JointTest) -> dict[str, Any]:
     out = {"rate (1/s)": (rate, ""), "share of χ² (%)": (f"{100 * own.chi2_share:.1f}", "")}
     for curve in MISFITS:
         levels = [one.noise[curve]["sigma"] for one in found.tests.values() if curve in one.noise]
-        if curve in own.noise:
+        if (level := own.noise.get(curve)) is not None:
             unit = "m" if curve.startswith("displ") else "Pa"
             factor, unit = readable_unit(max(levels), unit)
-            level = own.noise[curve]
             note = words("noise", level=level, factor=factor)
             out[f"noise {MISFITS[curve]} ({unit})"] = (number(level["sigma"] / factor), note)
     return out
 
 
-def plot_joint(found: JointResult, *, width: str = TWO) -> Figure:
+def plot_joint(found: JointResult, *, width: str = figures.TWO) -> Figure:
     """Draw the loops, and below them the parameters of all tests side by side.
 
     Tests are sorted by rate if rates differ. At most `MOST_LOOPS` loops are drawn.
@@ -250,7 +246,7 @@ def plot_joint(found: JointResult, *, width: str = TWO) -> Figure:
         Panel(
             name,
             formula(own),
-            {names[t]: one.in_test(t) for t in names if one.tests and t in one.tests},
+            {names[t]: one.in_test(t) for t in names if t in (one.tests or {})},
             joint=one,
         )
         for own, (name, one) in zip(symbols(found.varied), found.varied.items(), strict=True)
@@ -295,7 +291,6 @@ def result_of(
     study: Study,
     tests: Mapping[str, Path],
     rates: Sequence[float | None],
-    rate0: float | None,
     fit: JointFit,
     alone: Together,
     slopes: Mapping[str, float],
@@ -339,7 +334,6 @@ def result_of(
         drive=drives.pop() if len(drives) == 1 else None,
         seed=study.seed,
         tests=of_tests,
-        rate0=rate0,
         parameters=parameters,
         covariance={"names": fit.point.names, "matrix": _common_covariance(fit)},
         specimens={"names": fit.correlation[0], "correlation": fit.correlation[1]},
@@ -425,14 +419,14 @@ def _with_words(
             elif misfit > POOR:
                 large.append((test, curve, misfit))
     rates = [rate for rate in result.rates if rate is not None]
-    top = max(result.tests.values(), key=lambda one: one.chi2_share)
+    first, top = max(result.tests.items(), key=lambda pair: pair[1].chi2_share)
     told: dict[str, Any] = {
         "result": result,
         "laws": RATES,
         "rates": f"{min(rates):.3g} to {max(rates):.3g} 1/s" if rates else "",
         "slopes": [(n, result.parameters[n].kind, half) for n, half in open_slopes.items()],
         "dominant": max(DOMINANT, MORE * top.n_data / fit.found.n_data),
-        "top": (next(name for name, one in result.tests.items() if one is top), top),
+        "top": (first, top),
         "lost": list(lost),
         "large": large,
         "wrong": wrong,

@@ -65,6 +65,11 @@ class Test:
     fit: FitResult | None = None
     study: str = ""  # name of the joint fit that it belongs to
 
+    def with_springs(self, drawn: Array) -> Array:
+        """Return its parameters with drawn springs."""
+        count = len(self.problem.model.names)
+        return np.append(drawn[:count], self.values[count:])
+
 
 @single_threaded
 def plan(
@@ -259,12 +264,11 @@ def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Kno
     known = replace(known, stretch=_stretch(known, tests))
     if not draws:
         return known
-    drawn, springs = _draws(known, tests, rng, draws), len(first.model.names)
+    drawn = _draws(known, tests, rng, draws)
     bread, meat = np.repeat(known.bread, draws, axis=0), np.repeat(known.meat, draws, axis=0)
     for i, one in enumerate(drawn):
         with suppress(SimulationError):  # a coarser simulation had followed the test
-            own = [said(t, np.append(one[:springs], test.values[springs:]))
-                   for t, test in enumerate(tests)]  # fmt: skip
+            own = [said(t, test.with_springs(one)) for t, test in enumerate(tests)]
             bread[i], meat[i] = np.sum(own, axis=0)
     return replace(known, draws=drawn, bread=bread, meat=meat)
 
@@ -339,8 +343,8 @@ def _draws(known: Known, tests: Sequence[Test], rng: np.random.Generator, count:
     thin, n_springs = [one.problem.thinned().objective for one in tests], len(problem.model.names)
 
     def cost(values: Array) -> float:
-        own = [np.append(values[:n_springs], one.values[n_springs:]) for one in tests]
-        return sum(float(np.sum(o.residual(v) ** 2)) for o, v in zip(thin, own, strict=True))
+        own = zip(thin, (one.with_springs(values) for one in tests), strict=True)
+        return sum(float(np.sum(objective.residual(v) ** 2)) for objective, v in own)
 
     noise = float(np.max(np.diag(known.meat[0]) / np.maximum(np.diag(known.bread[0]), 1e-300)))
     most = cost(known.values) + allowed + max(noise, 1.0) * float(stats.chi2.ppf(0.99, k))
