@@ -221,11 +221,12 @@ def identify(
     led = below is not None
     record = SearchRecord(options.seed, starts, began, compiled=SPENT.seconds, led=led)
     known = [] if below is None else carried(problem.space(), below.problem.space(), below.minima())
-    problem, record = _search(problem, tracker, record, options.vary, progress, known)
+    found = _search(Found(problem, tracker, record), options.vary, progress, known)
     if tracker.best_values is None:
-        tried, why = problem.objective.evaluations, "check the drive, the heights and the bounds"
+        objective, why = found.problem.objective, "check the drive, the heights and the bounds"
+        tried = objective.evaluations
         try:
-            problem.objective.simulate(problem.vector())
+            objective.simulate(found.problem.vector())
         except SimulationError as error:
             why = str(error)
         if options.fix:
@@ -234,7 +235,7 @@ def identify(
             f"{measurement.name}: none of the {tried} sets of parameters that were tried could be "
             f"simulated; {why}"
         )
-    return Found(problem, tracker, record)
+    return found
 
 
 def judge(
@@ -304,18 +305,14 @@ def _assess(
 
 
 def _search(
-    problem: Problem,
-    tracker: Tracker,
-    record: SearchRecord,
-    asked: Collection[str],
-    progress: Progress,
-    known: Sequence[Array],
-) -> tuple[Problem, SearchRecord]:
-    """Search and refine; return the problem, and the record with costs and reason of a stop.
+    begun: Found, asked: Collection[str], progress: Progress, known: Sequence[Array]
+) -> Found:
+    """Search and refine; the record has the costs and the reason of a stop.
 
     The search begins from points already `known`, if there are any. Along a given motion, contact
     and zeros are fitted after it only: the first rise shows them to a fraction of a sample.
     """
+    problem, tracker, record = begun.problem, begun.tracker, begun.record
     rng, early = np.random.default_rng(record.seed), list[Array]()
     thinned, impact = problem.thinned(), problem.objective.drive == "impact"
     coarse = Tracker(thinned.objective, tracker.deadline, tracker.better, looked=tracker.looked)
@@ -323,8 +320,8 @@ def _search(
     def search_thinned(problem: Problem) -> list[tuple[float, int]]:
         """Search on the thinned record; its ends become those of the tracker."""
         space = problem.space()
-        found: Any = {"rng": rng, "progress": progress, "known": known}
-        costs = search.search(coarse, space, starts=record.starts, **found)
+        how: Any = {"rng": rng, "progress": progress, "known": known}
+        costs = search.search(coarse, space, starts=record.starts, **how)
         reached = coarse.best_cost
         if not known:  # else springs were exchanged before
             exchange_springs(coarse, space)
@@ -357,6 +354,6 @@ def _search(
         if tracker.best_values is None and coarse.best_values is not None:
             tracker.consider(coarse.best_values)
         search.ensure_feasible(tracker, problem.space(), np.random.default_rng(record.seed))
-        return problem, replace(record, stopped=what_stopped(error))
+        return Found(problem, tracker, replace(record, stopped=what_stopped(error)))
     progress(1.0, "done")
-    return problem, record
+    return Found(problem, tracker, record)

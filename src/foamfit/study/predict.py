@@ -17,13 +17,7 @@ from foamfit.data.cycles import cycles_of, loading_rate
 from foamfit.data.measurement import ASKED, Measurement
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError, check_whole
-from foamfit.fitting.curves import (
-    check_drive,
-    check_time_shift,
-    choose_drive,
-    driving_motion,
-    is_exact,
-)
+from foamfit.fitting import curves
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.scenes import channel_of
@@ -122,10 +116,10 @@ def predict(
         values, drawn, redrawn = _draw(population, problem, point, draws, seed)
     halves = {"parameters": _by_parameters(population, aligning, point, tuple(aligned))}
     halves |= {"motion": _by_motion(problem, point)}
-    curves = dict[str, PredictedCurve]()
+    bands = dict[str, PredictedCurve]()
     for name in objective.counted:
         parts = {part: of_curves[name] for part, of_curves in halves.items() if name in of_curves}
-        curves[name] = _curve(problem, name, simulated.curves[name], drawn, source, parts)
+        bands[name] = _curve(problem, name, simulated.curves[name], drawn, source, parts)
     changing, count = population.scattering, population.fewest
     later = measurement.last_cycle or measurement.cycle
     warnings = render.sentences(
@@ -139,8 +133,8 @@ def predict(
         few=count if changing and count < max(3, min(len(changing), FEW_TESTS)) else None,
         scattering=changing,
         held=population.held,
-        untold=[c.channel for c in curves.values() if c.channel not in source.misses],
-        missed=[curve for curve in curves.values() if curve.inside < LEAST_INSIDE],
+        untold=[c.channel for c in bands.values() if c.channel not in source.misses],
+        missed=[curve for curve in bands.values() if curve.inside < LEAST_INSIDE],
         doubts=_doubts(problem),
         again=source.sha256 == measurement.data_sha256 and later > 1,
         drawn=len(values) if changing else draws,
@@ -148,7 +142,7 @@ def predict(
     )
     sentences = render.sentences(
         "predicted_sentences",
-        curves=curves.values(),
+        curves=bands.values(),
         scattering=changing,
         trends=population.trends,
         aligned=[
@@ -164,7 +158,7 @@ def predict(
         relaxation=source.model.relaxation,
         drive=objective.drive,
         seed=int(seed),
-        curves=curves,
+        curves=bands,
         misfit=objective.misfit(simulated),
         parameters=_parameters(population, springs, values),
         rate=rate,
@@ -204,9 +198,9 @@ def _doubts(problem: Problem) -> list[str]:
 
 def _problem(source: Source, measurement: Measurement, drive: str | None) -> Problem:
     """Return the problem of the test with the law of the result."""
-    chosen = drive or source.drive or choose_drive(measurement)
+    chosen = drive or source.drive or curves.choose_drive(measurement)
     try:
-        check_drive(measurement, chosen)
+        curves.check_drive(measurement, chosen)
     except InputError as error:
         if drive is not None:
             raise
@@ -215,7 +209,7 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
         ) from None
     inside, shift = source.interior_mass and chosen == "impact", False
     with suppress(InputError):  # if this record cannot have the time shift of the fitted one
-        check_time_shift(measurement, chosen)
+        curves.check_time_shift(measurement, chosen)
         shift = source.time_shift
     law, terms = source.model.name, source.model.relaxation
     problem = make_problem(
@@ -224,10 +218,10 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
     objective, same = problem.objective, source.sha256 == measurement.data_sha256
     if not same or source.smoothed is None or chosen != "displacement":
         return problem
-    if is_exact(objective.measurement):
+    if curves.is_exact(objective.measurement):
         return problem  # nothing is smoothed, but turns between samples are found
     # The fitted record, possibly with other cycles: smooth the motion only if the fit did.
-    motion = driving_motion(objective.measurement, objective.time, always=source.smoothed)
+    motion = curves.driving_motion(objective.measurement, objective.time, always=source.smoothed)
     followed = (motion if source.smoothed else None,)
     return replace(problem, objective=replace(objective, followed=followed))
 
@@ -295,7 +289,7 @@ def _draw(
     # Parameters outside the limits of a fit are clipped, as in a fit. Drawing them again would
     # distort the distribution of the other parameters.
     objective, specimens, tried = problem.objective, population.draws(seed), 0
-    values, curves = list[Array](), list[dict[str, Array]]()
+    values, drawn = list[Array](), list[dict[str, Array]]()
     limits = _limits(population, point[: len(population.source.parameters)])
     while len(values) < draws and tried < TRIES * draws:
         tried += 1
@@ -305,13 +299,13 @@ def _draw(
         except SimulationError:
             continue
         values.append(one)
-        curves.append({name: simulated.curves[name] for name in objective.counted})
+        drawn.append({name: simulated.curves[name] for name in objective.counted})
     if len(values) < FEWEST:
         raise SimulationError(
             f"{population.source.where}: only {len(values)} of {tried} specimens drawn from its "
             "scatter can be simulated; fix or share the parameters that are not determined"
         )
-    return values, curves, tried - len(values)
+    return values, drawn, tried - len(values)
 
 
 def _by_parameters(
