@@ -145,9 +145,8 @@ class Options(Given):
         """Return the problem of fitting one model."""
         chosen = self.params(measurement, model)
         if params is not None and chosen is not None:
-            raise InputError(
-                "fix and vary have no effect beside params; set the value and vary of params"
-            )
+            why = "fix and vary have no effect beside params; set the value and vary of params"
+            raise InputError(why)
         model = with_options(model, **self.of_springs)
         given = (self.drive, chosen or params, self.weights, self.interior_mass)
         more: Any = {"time_shift": self.time_shift, "relaxation": self.relaxation}

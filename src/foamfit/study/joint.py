@@ -198,9 +198,8 @@ def _links(study: Study, tests: Sequence[_Test]) -> Links:
         if kind not in RATES:
             continue
         if untimed := [test.file for test in free if test.rate is None]:
-            raise InputError(
-                f"{where} needs the strain rate of every test, but {untimed[0]} has no time"
-            )
+            why = f"{where} needs the strain rate of every test, but {untimed[0]} has no time"
+            raise InputError(why)
         if not _several([test.rate for test in free]):
             rate = f"{free[0].rate:.3g} 1/s" if free else "none"
             raise InputError(

@@ -108,9 +108,8 @@ def predict(
         point, aligned = _aligned(aligning, springs, population.scattering)
         simulated = objective.simulate(point, everything=True)
     except SimulationError as error:
-        raise SimulationError(
-            f"{measurement.name} cannot be predicted from {source.where}: {error}"
-        ) from None
+        why = f"{measurement.name} cannot be predicted from {source.where}: {error}"
+        raise SimulationError(why) from None
     values, drawn, redrawn = list[Array](), list[dict[str, Array]](), 0
     if population.scattering:
         values, drawn, redrawn = _draw(population, problem, point, draws, seed)

@@ -100,9 +100,8 @@ def _tests(path: Path, content: Mapping[str, Any]) -> tuple[tuple[str, Path, Pat
     except InputError as error:
         raise InputError(f"tests: {error}") from None
     if len(found) < 2:
-        raise InputError(
-            f"tests names {'one test' if found else 'none'}; a joint fit needs at least two"
-        )
+        why = f"tests names {'one test' if found else 'none'}; a joint fit needs at least two"
+        raise InputError(why)
     toml, specimens = _text('"a.toml"'), table_of(content, "specimens")
     own = checked(specimens, dict.fromkeys([name for name, _ in found], toml), "[specimens]")
     pairs = ((test, own.get(test[0], content.get("specimen"))) for test in found)
@@ -131,9 +130,8 @@ def _parameters(table: Mapping[str, Any], model: Model) -> tuple[dict[str, str],
             held[name] = float(value)
         else:
             wanted = ", ".join((*KINDS, AUTO))
-            raise InputError(
-                f"{where} = {value!r} must be one of {wanted}, or a number (SI) to fix it"
-            )
+            why = f"{where} = {value!r} must be one of {wanted}, or a number (SI) to fix it"
+            raise InputError(why)
     return kinds, held
 
 
