@@ -46,6 +46,7 @@ from foamfit.report.folder import (
     write_result,
 )
 from foamfit.report.listing import REFUSED, Row, row_of
+from foamfit.results import stamp
 from foamfit.solve import precompile
 from foamfit.springs import laws
 from foamfit.springs.model import Model, with_options
@@ -60,7 +61,7 @@ if TYPE_CHECKING:
 
 MOST_AHEAD = 1000  # tests submitted to the executor at a time
 PAUSE = 60.0  # least time between two summaries, s: of many tests, one takes seconds
-SCHEMA, VERSION = 1, version("foamfit")
+VERSION = version("foamfit")
 RECORD = "batch.json"  # in the folder of each test: its rows, and the fingerprint of their inputs
 # One fit at a time per process, also in an executor with threads: drawing is not thread-safe.
 _ALONE = threading.Lock()
@@ -421,8 +422,7 @@ def _written(task: Task) -> tuple[Row, ...]:
         fault = f"{type(error).__name__}: {error}"
         rows = task.refused(f"this is a defect of foamfit, please report it ({fault})")
     record = {
-        "schema": SCHEMA,
-        "foamfit": VERSION,
+        **stamp(),
         "fingerprint": task.fingerprint,
         "pages": task.recipe.pages,
         "figure_width": inches(task.recipe.width),

@@ -328,11 +328,8 @@ def result_of(
         loops += [] if loop is None else [loop._replace(name=name)]
     drives = {one.drive for one in of_tests.values()}
     result = JointResult(
-        name=study.name,
-        model=study.model,
-        relaxation=study.relaxation,
+        **{name: getattr(study, name) for name in ("name", "model", "relaxation", "seed")},
         drive=drives.pop() if len(drives) == 1 else None,
-        seed=study.seed,
         tests=of_tests,
         parameters=parameters,
         covariance={"names": fit.point.names, "matrix": _common_covariance(fit)},
@@ -420,22 +417,13 @@ def _with_words(
                 large.append((test, curve, misfit))
     rates = [rate for rate in result.rates if rate is not None]
     first, top = max(result.tests.items(), key=lambda pair: pair[1].chi2_share)
-    told: dict[str, Any] = {
-        "result": result,
-        "laws": RATES,
-        "rates": f"{min(rates):.3g} to {max(rates):.3g} 1/s" if rates else "",
-        "slopes": [(n, result.parameters[n].kind, half) for n, half in open_slopes.items()],
-        "dominant": max(DOMINANT, MORE * top.n_data / fit.found.n_data),
-        "top": (first, top),
-        "lost": list(lost),
-        "large": large,
-        "wrong": wrong,
-        "doubts": doubts,
-        "missed": missed,
-        "together": _span_of(fit.found.misfits),
-        "alone": _span_of(alone.misfits),
-        "n_vary": fit.found.n_vary,
-    }
+    slopes = [(name, result.parameters[name].kind, half) for name, half in open_slopes.items()]
+    told: dict[str, Any] = {"result": result, "laws": RATES, "slopes": slopes, "lost": list(lost)}
+    told |= {"large": large, "wrong": wrong, "doubts": doubts, "missed": missed}
+    told |= {"rates": f"{min(rates):.3g} to {max(rates):.3g} 1/s" if rates else ""}
+    told |= {"top": (first, top), "dominant": max(DOMINANT, MORE * top.n_data / fit.found.n_data)}
+    told |= {"together": _span_of(fit.found.misfits), "alone": _span_of(alone.misfits)}
+    told |= {"n_vary": fit.found.n_vary}
     warnings = sentences("joint_warnings", **told)
     status = "failed" if lost else "warnings" if warnings else "ok"
     said = sentences("joint_sentences", **told)

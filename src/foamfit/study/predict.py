@@ -120,35 +120,20 @@ def predict(
         parts = {part: of_curves[name] for part, of_curves in halves.items() if name in of_curves}
         bands[name] = _curve(problem, name, simulated.curves[name], drawn, source, parts)
     changing, count = population.scattering, population.fewest
-    later = measurement.last_cycle or measurement.cycle
-    warnings = render.sentences(
-        "predicted_warnings",
-        source=source,
-        test=measurement.name,
-        rate=rate,
-        outside=outside,
-        drive=objective.drive,
-        nearest=not np.array_equal(springs, population.point),
-        few=count if changing and count < max(3, min(len(changing), FEW_TESTS)) else None,
-        scattering=changing,
-        held=population.held,
-        untold=[c.channel for c in bands.values() if c.channel not in source.misses],
-        missed=[curve for curve in bands.values() if curve.inside < LEAST_INSIDE],
-        doubts=_doubts(problem),
-        again=source.sha256 == measurement.data_sha256 and later > 1,
-        drawn=len(values) if changing else draws,
-        draws=draws,
-    )
-    sentences = render.sentences(
-        "predicted_sentences",
-        curves=bands.values(),
-        scattering=changing,
-        trends=population.trends,
-        aligned=[
-            f"{name.replace('_', ' ')} {engineering(value, unit_of(name)).replace('-', '−')}"
-            for name, value in aligned.items()
-        ],
-    )
+    later, few = measurement.last_cycle or measurement.cycle, max(3, min(len(changing), FEW_TESTS))
+    told: dict[str, Any] = {"source": source, "test": measurement.name, "rate": rate}
+    told |= {"outside": outside, "drive": objective.drive, "doubts": _doubts(problem)}
+    told |= {"nearest": not np.array_equal(springs, population.point), "held": population.held}
+    told |= {"scattering": changing, "few": count if changing and count < few else None}
+    told |= {"drawn": len(values) if changing else draws, "draws": draws}
+    told |= {"again": source.sha256 == measurement.data_sha256 and later > 1}
+    told |= {"curves": bands.values(), "trends": population.trends}
+    told["untold"] = [one.channel for one in bands.values() if one.channel not in source.misses]
+    told["missed"] = [one for one in bands.values() if one.inside < LEAST_INSIDE]
+    told["aligned"] = [
+        f"{name.replace('_', ' ')} {engineering(value, unit_of(name)).replace('-', '−')}"
+        for name, value in aligned.items()
+    ]
     return Prediction(
         source=source.name,
         joint=source.joint,
@@ -166,8 +151,8 @@ def predict(
         draws=len(values),
         redrawn=redrawn,
         held=population.held,
-        sentences=sentences,
-        warnings=warnings,
+        sentences=render.sentences("predicted_sentences", **told),
+        warnings=render.sentences("predicted_warnings", **told),
         aligned=aligned,
     )
 
