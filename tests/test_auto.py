@@ -30,7 +30,7 @@ from foamfit.springs import laws
 from foamfit.springs.model import Model
 from foamfit.trust import evidence
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.residuals.residual_tests import find_structure, neighbours_test, runs_test
+from foamfit.trust.evidence import find_structure, neighbours_test, runs_test
 
 HEIGHT, AREA = 1.2e-3, 1.9635e-5
 

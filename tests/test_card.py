@@ -16,7 +16,7 @@ import pytest
 import fabricated
 import foamfit as ff
 from conftest import DATA, needs_data, run, run_refused, specimen_toml, thinned
-from foamfit.cards import curves as card_curves
+from foamfit.cards import loading
 from foamfit.cards.card import FORMATS, UNITS
 from foamfit.data.measurement import Specimen
 from foamfit.results import Curves
@@ -133,17 +133,17 @@ def test_curves_end_where_a_bistable_law_ends() -> None:
 # ------------------------------------------------------------------------------- unloading
 
 
-def replayed(style: str, strain: np.ndarray, unloading: card_curves.Unloading) -> np.ndarray:
+def replayed(style: str, strain: np.ndarray, unloading: loading.Unloading) -> np.ndarray:
     """Return the stress of a card with one curve, σ = ε² MPa, for strain samples 1 s apart."""
     x = np.linspace(0.0, 1.0, 4001)
-    curves = card_curves.Curves(np.array([1e-3]), x, 1e6 * x[None] ** 2, 1.0)
+    curves = loading.Curves(np.array([1e-3]), x, 1e6 * x[None] ** 2, 1.0)
     first = strain >= np.maximum.accumulate(strain)
-    motion = card_curves.Motion(strain, np.gradient(strain), first)
-    return card_curves.REPLAYS[style](curves, motion)(unloading)
+    motion = loading.Motion(strain, np.gradient(strain), first)
+    return loading.REPLAYS[style](curves, motion)(unloading)
 
 
 def test_unloading_follows_the_formula_of_the_solvers() -> None:
-    hu, shape, expon = unloading = card_curves.Unloading(0.1, 1.7, 0.6)
+    hu, shape, expon = unloading = loading.Unloading(0.1, 1.7, 0.6)
     down, up = np.linspace(0.8, 0.2, 61), np.linspace(0.2, 0.9, 71)[1:]
     strain = np.concatenate([np.linspace(0.0, 0.8, 81), down[1:], up])
     # W is proportional to ε³.
@@ -160,9 +160,9 @@ def test_unloading_follows_the_formula_of_the_solvers() -> None:
 @pytest.mark.parametrize("style", FORMATS)
 def test_the_unloading_of_a_card_is_found_again(style: str) -> None:
     strain = np.concatenate([np.linspace(0.0, 1.0, 101), np.linspace(1.0, 0.0, 101)[1:]])
-    true = card_curves.Unloading(0.15, 2.3, 1.0 if style == "mat057" else 0.7)
+    true = loading.Unloading(0.15, 2.3, 1.0 if style == "mat057" else 0.7)
     target = replayed(style, strain, true)
-    found = card_curves.fit_unloading(
+    found = loading.fit_unloading(
         [lambda one: replayed(style, strain, one)], [target], expon=style != "mat057"
     )
     np.testing.assert_allclose(found, true, rtol=1e-3)

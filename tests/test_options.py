@@ -9,8 +9,7 @@ import pytest
 
 import foamfit as ff
 from conftest import ROOT
-from foamfit.cli.fit import fit
-from foamfit.cli.many import batch
+from foamfit.cli.fit import batch, fit
 from foamfit.one_model import Options
 from foamfit.options import OF_FIT, OPTIONS, Given, Keywords, table
 from foamfit.study.study_file import _KEYS

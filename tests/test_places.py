@@ -13,7 +13,7 @@ from click.testing import Result
 import fabricated
 import foamfit as ff
 from conftest import run, run_refused, without_pictures, write_csv
-from foamfit.cli.results import _named
+from foamfit.cli.others import _named
 
 TOML = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\nmass = "1 g"\n'
 FAST = ("--model", "linear", "--quiet", "--no-report")

@@ -16,10 +16,9 @@ from foamfit.errors import InputError
 from foamfit.fitting.minimizer import minimizer_of, result_of
 from foamfit.one_model import SEARCHED, Options, Progress, identify, judge, part_of
 from foamfit.options import Keywords, documented
-from foamfit.report.folder import write_result
+from foamfit.report.folder import Result, brief, write_result
 from foamfit.report.plots import draw_panel
 from foamfit.report.readable import readable
-from foamfit.report.shown import Result, brief
 from foamfit.report.summary import compared, summary_text
 from foamfit.report.tables import frame
 from foamfit.results import Fit

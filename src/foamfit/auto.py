@@ -18,7 +18,6 @@ from functools import partial
 from typing import Any
 
 import lmfit
-import numpy as np
 
 from foamfit import one_model
 from foamfit.arrays import Array
@@ -37,9 +36,8 @@ from foamfit.springs.parameters import split_name
 from foamfit.text import percent
 from foamfit.trust import evidence
 from foamfit.trust.checklist import input_first
-from foamfit.trust.evidence import BLOCKS, MARGIN, SHARE, Tried, misfit_of, predicted_misfit
+from foamfit.trust.evidence import BENT, BLOCKS, MARGIN, SHARE, Tried, misfit_of, predicted_misfit
 from foamfit.trust.intervals import Announce, Choice
-from foamfit.trust.residuals.residual_tests import BENT, find_structure, neighbours_test, runs_test
 
 # Groups of models, from the simplest up: one spring; a linear spring below it, or relaxation (tried
 # first except in impacts, where it is slower); one spring that softens after snapping; two springs;
@@ -345,10 +343,7 @@ def _conclude(state: _Comparison) -> Fit:
         higher = criteria[nearest].bic - criteria[decision.best].bic
         told |= {"sound": tried[nearest], "higher": higher}
     if result.at_noise is False and not any(one.structureless for one in tried):
-        tests = [min(runs_test(part), neighbours_test(part)) for part in best.curves]
-        worst = int(np.argmin(tests))
-        left = find_structure(best.curves[worst], best.places[worst])
-        told |= {"left": left, "curve": best.counted[worst], "size": left.size / best.spans[worst]}
+        told |= best.structure()
     said = render.sentences("choice", part="choice", **told)
     warned = render.sentences("choice", part="cautions", **told)
     reference = evidence.reference_of(tried)

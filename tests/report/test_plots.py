@@ -13,8 +13,7 @@ import foamfit as ff
 from foamfit.api import FitResult
 from foamfit.errors import InputError
 from foamfit.report.figures import images, save
-from foamfit.report.plots import origin_word, plot_fit, plot_response
-from foamfit.report.result_figures import plot_snapping
+from foamfit.report.plots import origin_word, plot_fit, plot_response, plot_snapping
 from foamfit.results import Switch
 
 

@@ -22,7 +22,7 @@ import pytest
 import fabricated
 import foamfit as ff
 from conftest import HEIGHT, Inline, run, run_refused, synthetic_impact, write_csv
-from foamfit.cli import many as command
+from foamfit.cli import fit as command
 from foamfit.report.listing import Row, row_of, write_comparison, write_page
 from foamfit.study import batch as module
 from foamfit.study.batch import work

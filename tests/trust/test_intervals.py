@@ -30,14 +30,13 @@ from foamfit.errors import InputError
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord, Tracker
 from foamfit.one_model import Found, judge
-from foamfit.report import result_figures
-from foamfit.report.result_figures import plot_profiles
+from foamfit.report import plots
+from foamfit.report.plots import plot_profiles
 from foamfit.results import Profile
 from foamfit.trust import intervals
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
-from foamfit.trust.intervals import Choice, assess
-from foamfit.trust.markov_chain import mcmc
+from foamfit.trust.intervals import Choice, assess, mcmc
 from foamfit.trust.profile import trace
 from foamfit.trust.residuals.noise_process import NoiseProcess, noise_processes
 
@@ -389,7 +388,7 @@ def test_says_in_one_sentence_that_emcee_is_missing(monkeypatch):
 
 
 def test_the_result_says_what_made_each_interval(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(result_figures, "plot_fit", lambda *_, **__: Figure())
+    monkeypatch.setattr(plots, "plot_fit", lambda *_, **__: Figure())
     _, measurement = synthetic_impact(samples=201)
     told: list[str] = []
     result = ff.fit(measurement, starts=1, intervals="profile", tell=told.append)

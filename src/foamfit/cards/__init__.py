@@ -1,5 +1,5 @@
 """Material cards of a fitted law for finite elements, and their deviation from the law.
 
-`curves` computes the loading curves, evaluates a card as its solver does and fits its unloading;
+`loading` computes the loading curves, evaluates a card as its solver does and fits its unloading;
 `card` writes the files. The texts of the cards are templates.
 """

@@ -6,6 +6,7 @@ import json
 import math
 import textwrap
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,18 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foamfit.arrays import Array, single_threaded
-from foamfit.cards.curves import (
-    REPLAYS,
-    Curves,
-    Motion,
-    Unloading,
-    fit_unloading,
-    fitted_rates,
-    follow,
-    guessed,
-    loading_curves,
-    unloading_curve,
-)
+from foamfit.cards import loading
 from foamfit.codec import plain
 from foamfit.data.cycles import loading_rate
 from foamfit.data.noise import with_noise
@@ -35,9 +25,9 @@ from foamfit.fitting.curves import driving_motion
 from foamfit.parts import law_in_words
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, FITTED, SEEN, images
+from foamfit.report.folder import Result
 from foamfit.report.readable import readable_unit
-from foamfit.report.render import environment, words
-from foamfit.report.shown import Result
+from foamfit.report.render import environment, sentences
 from foamfit.results import Fit
 from foamfit.study.identified import read_source
 from foamfit.study.joint_result import JointResult
@@ -151,8 +141,8 @@ class Card:
     format: str
     units: str
     law: str
-    curves: Curves
-    unloading: Unloading
+    curves: loading.Curves
+    unloading: loading.Unloading
     misfit: dict[str, float | None]
     density: float | None
     warnings: tuple[str, ...]
@@ -188,7 +178,7 @@ class Card:
             "strain": self.curves.strain.tolist(),
             "stresses": (pa * stresses).tolist(),
         }
-        text = (one.encode("ascii", "replace").decode() for one in _lines("comments", **values))
+        text = (one.encode("ascii", "replace").decode() for one in sentences("comments", **values))
         lines = (line for one in text for line in textwrap.wrap(one, _LINE))
         values["comments"] = "\n".join(f"{sign} {line}" for line in lines)
         template = environment().get_template(f"{self.format}{ending}")
@@ -202,13 +192,13 @@ class Card:
         # Abaqus rejects curves that meet; beyond the last rate it uses the last curve.
         kept = [0, *(1 + np.flatnonzero(np.any(np.diff(stress, axis=0) > 0.0, axis=1)))]
         apart = np.cumprod([[1.0], *[[1.001]] * (len(kept) - 1)], axis=0)
-        loading = apart * np.maximum.accumulate(stress[kept] / apart, axis=0)
-        back = unloading_curve(self.curves, self.unloading)
-        return np.array([-rates[0], *rates[kept]]), np.vstack([back, loading])
+        loaded = apart * np.maximum.accumulate(stress[kept] / apart, axis=0)
+        back = loading.unloading_curve(self.curves, self.unloading)
+        return np.array([-rates[0], *rates[kept]]), np.vstack([back, loaded])
 
     def __repr__(self) -> str:
         """Return a summary of the card and its warnings, as the command prints them."""
-        return "\n".join(_lines("terminal", card=self))
+        return "\n".join(sentences("terminal", card=self))
 
     def save(self, path: str | Path) -> Path:
         """Write the card, PATH.json, PATH.png and PATH.pdf; return the path.
@@ -230,14 +220,10 @@ class Card:
 
 def _check_own(path: Path, beside: Path) -> None:
     """Raise InputError if the file exists and is not a card, which has a FILE.json beside it."""
-    if not path.is_file():
-        return
-    try:
-        own = {"format", "curves"} <= json.loads(beside.read_bytes()).keys()
-    except (OSError, ValueError, AttributeError):
-        own = False
-    if not own:
-        raise InputError(f"{path} exists and is not a card of foamfit; choose another name")
+    with suppress(OSError, ValueError, AttributeError):
+        if not path.is_file() or {"format", "curves"} <= json.loads(beside.read_bytes()).keys():
+            return
+    raise InputError(f"{path} exists and is not a card of foamfit; choose another name")
 
 
 def draw(card: Card) -> Figure:
@@ -310,27 +296,28 @@ def card(
             "unloading; a card needs a fit with a hysteretic spring"
         )
     records = read_records(result)
-    requested = requested or fitted_rates(source) or [1.0]
+    requested = requested or loading.fitted_rates(source) or [1.0]
     chosen = [requested[(len(requested) - 1) // 2]] if format == "mat057" else requested
-    curves, crossed = loading_curves(source, chosen, max(one.motion.max() for one in records))
-    replays = [REPLAYS[format](curves, Motion.of(one.motion, one.time)) for one in records]
-    laws = [follow(source, one.rate, one.motion, one.time).base_stress for one in records]
-    targets = [  # cards contain no tension
-        np.where(one.motion > 0.0, law, 0.0) for one, law in zip(records, laws, strict=True)
-    ]
-    unloading = fit_unloading(replays, targets, expon=format != "mat057")
+    measured_to = max(one.motion.max() for one in records)
+    curves, crossed = loading.curves_at(source, chosen, measured_to)
+    motions = (loading.Motion.of(one.motion, one.time) for one in records)
+    replays = [loading.REPLAYS[format](curves, motion) for motion in motions]
+    laws = (loading.follow(source, one.rate, one.motion, one.time).base_stress for one in records)
+    pairs = zip(records, laws, strict=True)
+    targets = [np.where(one.motion > 0.0, law, 0.0) for one, law in pairs]  # cards have no tension
+    unloading = loading.fit_unloading(replays, targets, expon=format != "mat057")
     records = [
         replace(one, card=replay(unloading)) for one, replay in zip(records, replays, strict=True)
     ]
     densities = [one.density for one in records if one.density is not None]
-    warnings = _lines(
+    warnings = sentences(
         "warnings",
         source=source,
         format=format,
         requested=requested,
         chosen=chosen,
         crossed=crossed,
-        guessed=guessed(source, curves),
+        guessed=loading.guessed(source, curves),
         density=bool(densities),
     )
     made = Card(
@@ -345,7 +332,7 @@ def card(
             "card": _rms(one.misfit_of_card for one in records),
         },
         density=float(np.mean(densities)) if densities else None,
-        warnings=tuple(warnings),
+        warnings=warnings,
         records=tuple(records),
     )
     if out is not None:
@@ -361,10 +348,9 @@ def check(format: str, units: str, rates: float | Iterable[float | str] | None) 
     if rates is None:
         return []
     given = [rates] if isinstance(rates, str | int | float) else list(rates)
-    try:
+    found = list[float]()
+    with suppress(TypeError, ValueError):
         found = sorted({float(rate) for rate in given})
-    except (TypeError, ValueError):
-        found = []
     if not found or not all(0.0 < rate < math.inf for rate in found):
         raise InputError(
             f"rates = {','.join(map(str, given))} must be positive numbers in 1/s, like 0.01,1,100"
@@ -373,11 +359,5 @@ def check(format: str, units: str, rates: float | Iterable[float | str] | None) 
 
 
 def _rms(values: Iterable[float | None]) -> float | None:
-    """Return the root mean square of the values that are not None."""
     known = [value for value in values if value is not None]
     return float(np.sqrt(np.mean(np.square(known)))) if known else None
-
-
-def _lines(name: str, **values: Any) -> list[str]:
-    """Return the nonempty lines of a text."""
-    return [line for line in words(name, **values).splitlines() if line.strip()]

@@ -4,7 +4,7 @@ Heavy modules are imported inside the commands that need them. Begin with `fit`;
 exit codes and the handling of errors, `options` the options shared by several commands.
 """
 
-from foamfit.cli import fit, many, results, start  # noqa: F401
+from foamfit.cli import fit, others  # noqa: F401
 from foamfit.cli.group import main
 
 __all__ = ["main"]

@@ -66,10 +66,8 @@ class _Group(click.Group):
         except Exception as error:
             if os.environ.get("FOAMFIT_TRACEBACK"):
                 raise
-            defect = (
-                f"this is a defect of foamfit, please report it ({type(error).__name__}: {error})"
-            )
-            _leave(DEFECT, f"{defect}; FOAMFIT_TRACEBACK=1 shows where it is")
+            told = f"({type(error).__name__}: {error}); FOAMFIT_TRACEBACK=1 shows where it is"
+            _leave(DEFECT, f"this is a defect of foamfit, please report it {told}")
         sys.exit(code if isinstance(code, int) else 0)
 
 

@@ -21,7 +21,7 @@ from foamfit.options import OPTIONS
 from foamfit.terminal import say, without_ctrl_c
 
 if TYPE_CHECKING:
-    from foamfit.report.shown import Result
+    from foamfit.report.folder import Result
 
 Command = Callable[..., Any]
 FILE, WHOLE, COUNT = click.Path(path_type=Path), click.IntRange(min=0), click.IntRange(min=1)
@@ -46,12 +46,8 @@ def _width(context: click.Context, parameter: click.Parameter, value: str) -> st
 TEST = click.argument("test", metavar="TEST.csv", type=FILE)
 
 
-def _range(
-    context: click.Context, parameter: click.Parameter, text: str | None
-) -> tuple[int, int] | None:
+def _range(text: str) -> tuple[int, int]:
     """Return the first and the last cycle of --cycles."""
-    if text is None:
-        return None
     first, dash, last = (part.strip() for part in text.partition("-"))
     if not (dash and first.isdecimal() and last.isdecimal() and 0 < int(first) <= int(last)):
         raise click.BadParameter(f"'{text}' is not FIRST-LAST in that order, like 1-3.")
@@ -93,7 +89,7 @@ def _fixes(
 READ: dict[str, dict[str, Any]] = {
     "specimen": {"type": FILE},
     "cycle": {"type": str, "callback": _cycles},
-    "cycles": {"type": str, "callback": _range},
+    "cycles": {"type": _range},
     "fix": {"type": str, "multiple": True, "callback": _fixes},
     "vary": {"type": str, "multiple": True},
 }
@@ -103,14 +99,9 @@ def declared(name: str, **more: Any) -> Callable[[Command], Command]:
     """Declare an option of `foamfit.options`; `more` are arguments of click that differ."""
     one = OPTIONS[name]
     how: dict[str, Any] = {"help": one.text, "default": one.default, "metavar": one.metavar or None}
-    if one.choices:
-        how["type"] = click.Choice(one.choices)
-    elif one.kind == "bool":
-        how["is_flag"] = True
-    elif one.kind == "int":
-        how["type"] = click.IntRange(one.least, one.most)
-    elif one.kind == "float":
-        how["type"] = float
+    whole = click.IntRange(one.least, one.most)
+    kinds: Any = {"bool": {"is_flag": True}, "int": {"type": whole}, "float": {"type": float}}
+    how |= {"type": click.Choice(one.choices)} if one.choices else kinds.get(one.kind, {})
     return click.option(one.flag, **how | READ.get(name, {}) | more)
 
 
@@ -146,13 +137,6 @@ class Output:
     def silent(self) -> bool:
         """Whether only failures and a result as JSON are printed."""
         return self.quiet or self.as_json
-
-    def check(self, *, without_report: bool = True) -> None:
-        """Reject --open with --json (a browser may print on stdout), or without a page to open."""
-        pageless = self.no_report and not without_report
-        if self.opening and (self.as_json or pageless):
-            given = "json" if self.as_json else "no-report"
-            raise InputError(f"--open and --{given} exclude each other; leave one of them out")
 
     def folder(self, default: Path, of: str | None = None) -> Path:
         """Return the result folder; InputError if it cannot be written.
@@ -223,8 +207,12 @@ def open_page(page: Path) -> None:
         say(f"foamfit: no browser could be opened; open {page} by hand", err=True)
 
 
-def output(folder: str, printed: str) -> Callable[[Command], Command]:
-    """Add the options of `Output` to a command; `folder` and `printed` complete its help."""
+def output(folder: str, printed: str, *, always_page: bool = False) -> Callable[[Command], Command]:
+    """Add the options of `Output` to a command; `folder` and `printed` complete its help.
+
+    --open is rejected with --json (a browser may print on stdout), and with --no-report unless the
+    command writes a page even so.
+    """
     options = together(
         option("--out", f"Result folder. Default: {folder}.", FILE),
         option("--no-report", "Write tables only: no reports and no figures."),
@@ -238,6 +226,9 @@ def output(folder: str, printed: str) -> Callable[[Command], Command]:
         @functools.wraps(command)
         def run(**given: Any) -> Any:
             wanted = Output(**{one.name: given.pop(one.name) for one in fields(Output)})
+            if wanted.opening and (wanted.as_json or (wanted.no_report and not always_page)):
+                other = "json" if wanted.as_json else "no-report"
+                raise InputError(f"--open and --{other} exclude each other; leave one of them out")
             return command(output=wanted, **given)
 
         return options(run)

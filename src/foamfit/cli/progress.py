@@ -7,7 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any, TextIO
 
 from foamfit.terminal import printable, say
@@ -124,9 +124,6 @@ def progress_line(quiet: bool, name: str, *, says: bool = True) -> Iterator[Prog
         return
     from tqdm.contrib.logging import logging_redirect_tqdm
 
-    with logging_redirect_tqdm([logging.getLogger("foamfit")]):
-        line = ProgressLine(sys.stderr, name)
-        try:
-            yield line
-        finally:
-            line.close()
+    log = logging.getLogger("foamfit")
+    with logging_redirect_tqdm([log]), closing(ProgressLine(sys.stderr, name)) as line:
+        yield line

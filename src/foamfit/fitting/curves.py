@@ -130,16 +130,13 @@ def default_weights(measurement: Measurement, drive: str, springs: int = 1) -> d
     """
     weights = dict.fromkeys(CURVES, 0.0)
     weights |= dict.fromkeys(interior_curves(measurement, springs), 1.0)
-    if drive == "impact":
-        weights["stress_time"] = float("stress" not in measurement.derived)
-        moved = measurement.displacement is not None and measurement.motion != INTEGRATED
-        weights["displacement_time"] = float(moved and "displacement" not in measurement.derived)
-        if measurement.acceleration is not None:
-            weights[ACCELERATION] = 1.0
-    elif drive == "stress":
-        weights["displacement_time"] = 1.0
-    else:
-        weights["stress_strain"] = 1.0
+    if drive != "impact":
+        return weights | {"displacement_time" if drive == "stress" else "stress_strain": 1.0}
+    moved = measurement.displacement is not None and measurement.motion != INTEGRATED
+    weights["stress_time"] = float("stress" not in measurement.derived)
+    weights["displacement_time"] = float(moved and "displacement" not in measurement.derived)
+    if measurement.acceleration is not None:
+        weights[ACCELERATION] = 1.0
     return weights
 
 
@@ -150,11 +147,7 @@ def smooth_stress(measurement: Measurement, time: Array) -> SmoothMotion | None:
     """
     stress, level = measurement.stress, measurement.noise.of("stress")
     assert stress is not None  # checked by check_drive
-    if (
-        measurement.striker is not None
-        or level is None
-        or level.sigma <= EXACT * float(np.ptp(stress))
-    ):
+    if measurement.striker is not None or level is None or level.sigma <= EXACT * np.ptp(stress):
         return None
     found = follow(time, stress, level, measurement.sampled.get("stress"))
     return found if found.sigma <= FOLLOWED * level.sigma else None

@@ -51,11 +51,9 @@ class Links:
 
     def of(self, tests: list[int]) -> Links:
         """Return the links of a subset of the tests."""
-        return replace(
-            self,
-            log_rates=None if self.log_rates is None else self.log_rates[tests],
-            pulls={name: pull[tests] for name, pull in self.pulls.items()},
-        )
+        rates = None if self.log_rates is None else self.log_rates[tests]
+        pulls = {name: pull[tests] for name, pull in self.pulls.items()}
+        return replace(self, log_rates=rates, pulls=pulls)
 
 
 def factor(kind: str, b: float, x: float) -> tuple[float, float]:

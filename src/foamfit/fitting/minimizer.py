@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import lmfit
 import numpy as np
@@ -92,24 +92,22 @@ def result_of(fit: Fit) -> MinimizerResult:
     sizes = np.array([params[name].stderr for name in names], dtype=float)
     places = [found.names.index(name) for name in names] if found else []
     matrix = found.matrix[np.ix_(places, places)] if found else np.empty((0, 0))
-    values: dict[str, Any] = {
-        "params": params,
-        "var_names": names,
-        "covar": matrix * np.outer(sizes, sizes),
-        "errorbars": bool(names),
-        "method": METHOD,
-        "ndata": numbers["n_data"],
-        "nvarys": numbers["n_vary"],
-        "nfree": int(numbers["n_data"] or 0) - int(numbers["n_vary"] or 0),
+    out = MinimizerResult(
+        params=params,
+        var_names=names,
+        covar=matrix * np.outer(sizes, sizes),
+        errorbars=bool(names),
+        method=METHOD,
+        ndata=numbers["n_data"],
+        nvarys=numbers["n_vary"],
+        nfree=int(numbers["n_data"] or 0) - int(numbers["n_vary"] or 0),
         **{name: numbers[name] for name in ("chisqr", "redchi", "aic", "bic", "nfev")},
-        "success": fit.stopped is None,
-        "aborted": fit.stopped is not None,
-        "message": "; ".join(fit.warnings) or "Fit succeeded.",
-        "init_vals": [],
-        "init_values": {},
-    }
-    out = MinimizerResult(**values)
-    if fit.problem is not None:
-        problem = fit.problem
+        success=fit.stopped is None,
+        aborted=fit.stopped is not None,
+        message="; ".join(fit.warnings) or "Fit succeeded.",
+        init_vals=[],
+        init_values={},
+    )
+    if (problem := fit.problem) is not None:
         out.residual = problem.objective.residual(problem.vector(fit.params) - problem.origins)
     return out

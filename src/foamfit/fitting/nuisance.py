@@ -17,7 +17,7 @@ import numpy as np
 
 from foamfit.data.calibration import balance
 from foamfit.data.cycles import cycles_of
-from foamfit.data.measurement import INTEGRATED, Measurement
+from foamfit.data.measurement import Measurement
 from foamfit.data.noise import lowest_mean
 from foamfit.springs.parameters import NUISANCE
 
@@ -25,11 +25,7 @@ CONTACT_TIME, TIME_SHIFT = "contact_time", "time_shift"
 VELOCITY, STRIKER_MASS = "velocity", "striker_mass"
 FORCE_SCALE = "force_scale"  # true force over measured force
 # Zeros of the channels: the reading of a channel when the quantity is zero.
-ZEROS = {
-    "displacement_zero": "displacement",
-    "stress_zero": "stress",
-    "acceleration_zero": "acceleration",
-}
+ZEROS = {f"{channel}_zero": channel for channel in ("displacement", "stress", "acceleration")}
 STRIKER = (VELOCITY, STRIKER_MASS)
 POSITIVE = (*STRIKER, FORCE_SCALE)  # positive parameters, each of which is its own scale
 UNDER_DRIVE = {
@@ -107,12 +103,13 @@ def open_in(measurement: Measurement, drive: str, counted: Mapping[str, bool]) -
     """
     priors = priors_of(measurement, drive)
     known = {name for name in priors if counted.get(ZEROS.get(name, ""), True)} - {FORCE_SCALE}
+    moved = counted["displacement"]
     if drive == "impact":
-        moved = {"displacement_zero"} if counted.get("displacement", False) else set()
-        return frozenset({CONTACT_TIME} | moved | known)
-    elsewhere = measurement.origins.get("displacement_zero", 0.0) != 0.0
-    moved = {"displacement_zero"} if elsewhere or measurement.contact != "file" else set()
-    return frozenset(moved | known)
+        known.add(CONTACT_TIME)
+    else:
+        elsewhere = measurement.origins.get("displacement_zero", 0.0) != 0.0
+        moved = elsewhere or measurement.contact != "file"
+    return frozenset(known | {"displacement_zero"} if moved else known)
 
 
 def shown_by(measurement: Measurement, drive: str, *, late: bool = False) -> dict[str, Prior]:
@@ -185,14 +182,11 @@ def limits_of(
     """
     prior, middle = priors_of(measurement, drive).get(name), values_of(measurement)[name]
     rise = None if prior is not None else shown_by(measurement, drive, late=late).get(name)
-    if name == FORCE_SCALE and not _shows_force(measurement):
-        return middle, middle
     if prior is not None:
         reach = REACH * prior.sigma
         reach = min(reach, 0.9 * middle) if name in POSITIVE else reach
     elif rise is not None:
-        ends = rise.mean - REACH_OF_RISE * rise.sigma, rise.mean + REACH_OF_RISE * rise.sigma
-        return _within_height(name, measurement, min(*ends, middle), max(*ends, middle))
+        reach = REACH_OF_RISE * rise.sigma
     elif name in POSITIVE:
         reach = 0.9 * middle
     elif name in ZEROS:
@@ -200,25 +194,13 @@ def limits_of(
         reach = 0.0 if values is None else LARGEST_ZERO * float(np.ptp(values))
     else:
         reach = (LARGEST_CONTACT if name == CONTACT_TIME else LARGEST_SHIFT) * duration
-    latest = _latest_contact(measurement) if name == CONTACT_TIME else 0.0
-    return _within_height(name, measurement, middle - reach, middle + max(reach, latest))
-
-
-def _within_height(
-    name: str, measurement: Measurement, low: float, high: float
-) -> tuple[float, float]:
-    """Return the limits of a zero at which the measured strain stays below one."""
-    if name != "displacement_zero" or measurement.displacement is None:
-        return low, high
-    least = float(measurement.displacement.max()) - LARGEST_STRAIN * measurement.specimen.height
-    return min(max(low, least), 0.0), high
-
-
-def _shows_force(measurement: Measurement) -> bool:
-    """Return whether an impact shows the scale of its force: by a motion or an acceleration."""
-    moved = measurement.displacement is not None and measurement.motion != INTEGRATED
-    moved = moved and "displacement" not in measurement.derived
-    return "stress" not in measurement.derived and (moved or measurement.acceleration is not None)
+    at = middle if rise is None else rise.mean
+    latest = _latest_contact(measurement) if name == CONTACT_TIME and rise is None else 0.0
+    low, high = min(at - reach, middle), max(at + reach, middle + latest)
+    if name == "displacement_zero" and measurement.displacement is not None:
+        least = float(measurement.displacement.max()) - LARGEST_STRAIN * measurement.specimen.height
+        low = min(max(low, least), 0.0)
+    return low, high
 
 
 def _latest_contact(measurement: Measurement) -> float:

@@ -10,6 +10,7 @@ import math
 import time
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -55,11 +56,21 @@ THIN = 0.8  # a record is thinned if at most this fraction of its samples is lef
 class Simulated:
     """The curves of one set of parameters, the simulated motion, and derivatives on request."""
 
-    # By the names in `Objective.curves`, without those that the drive prescribes, the test lacks or
-    # the residual does not need; stress_strain is the stress (Pa) along the measured displacement.
-    curves: dict[str, Array]
+    # Curves stacked on their p derivatives, (1 + p, n), by the names in `Objective.curves`, without
+    # those that the drive prescribes, the test lacks or the residual does not need; stress_strain
+    # is the stress (Pa) along the measured displacement.
+    rows: dict[str, Array]
     motion: Motion  # At the times of the samples if everything was requested
-    slopes: dict[str, Array] | None = None  # Derivatives of each curve, (p, n)
+
+    @cached_property
+    def curves(self) -> dict[str, Array]:
+        """The curves, (n,) each."""
+        return {name: rows[0] for name, rows in self.rows.items()}
+
+    @property
+    def slopes(self) -> dict[str, Array]:
+        """Derivatives of each curve, (p, n)."""
+        return {name: rows[1:] for name, rows in self.rows.items()}
 
 
 class Effort(NamedTuple):
@@ -128,6 +139,7 @@ class Objective:
             self.interior_mass, self.followed, self.averaged, self.glued,
         )  # fmt: skip
         self.time, self.usual = self.scenes.time, self.scenes.usual
+        self.driven = self.scenes.driven  # whether the measured motion drives the springs
         self.measured = self._measured()
         self.counted = tuple(name for name in self.measured if self.weights[name] > 0)
         if not self.counted:
@@ -205,11 +217,6 @@ class Objective:
     def motion(self) -> SmoothMotion | None:
         """The measured motion without its noise, or None; see `driving_motion`."""
         return self.scenes.motion
-
-    @property
-    def driven(self) -> bool:
-        """Whether the measured motion drives the springs."""
-        return self.scenes.driven
 
     def weigh_motion(self, values: Array) -> bool:
         """Weight the residuals by the uncertainty of the driving motion; False if it has none.
@@ -294,24 +301,6 @@ class Objective:
 
     # ------------------------------------------------------------------ simulation and residual
 
-    def _simulated(
-        self, values: Array, places: Places, everything: bool = False
-    ) -> tuple[dict[str, Array], Motion]:
-        """Return curves stacked on their derivatives; count the evaluation and its failure."""
-        began = time.perf_counter()
-        self.spent.evaluations += 1
-        self.spent.sloped += places.size > 0
-        try:
-            return self.scenes.rows(values, places, self.counted, everything)
-        except SimulationError:
-            self.spent.failures += 1
-            raise
-        except SystemError as error:
-            raise_signal(error)
-            raise
-        finally:
-            self.spent.seconds += time.perf_counter() - began
-
     def simulate(
         self, values: Array, *, everything: bool = False, places: Places = NOWHERE
     ) -> Simulated:
@@ -320,10 +309,19 @@ class Objective:
         `places` are the indices of the parameters by which derivatives are returned. Raises
         SimulationError if the parameters are not admissible or the scene has no finite answer.
         """
-        rows, motion = self._simulated(values, places, everything)
-        curves = {name: one[0] for name, one in rows.items()}
-        slopes = {name: one[1:] for name, one in rows.items()} if places.size else None
-        return Simulated(curves, motion, slopes)
+        began = time.perf_counter()
+        self.spent.evaluations += 1
+        self.spent.sloped += places.size > 0
+        try:
+            return Simulated(*self.scenes.rows(values, places, self.counted, everything))
+        except SimulationError:
+            self.spent.failures += 1
+            raise
+        except SystemError as error:
+            raise_signal(error)
+            raise
+        finally:
+            self.spent.seconds += time.perf_counter() - began
 
     @property
     def evaluations(self) -> int:
@@ -344,15 +342,17 @@ class Objective:
         finite penalty, and `spent.failures` is increased.
         """
         try:
-            rows, _ = self._simulated(values, NOWHERE)
+            return self.compare(self.simulate(values), values)
         except SimulationError:
             return np.append(np.full(self.n_data, self.penalty), self.off_priors(values))
-        return self._bounded(self._gathered(rows)[0], values)
 
     def compare(self, curves: Simulated, values: Array) -> Array:
         """Return the residuals of simulated curves; see `residual`."""
-        rows = {name: curves.curves[name][None] for name in self.counted}
-        return self._bounded(self._gathered(rows)[0], values)
+        off = self._gathered(curves.rows)[0]
+        # The stress may be huge near the pole of branch c.
+        off = np.maximum(np.minimum(off, self.penalty), -self.penalty)
+        off = off if self.weighing is None else self.weighing(off)
+        return np.concatenate((off, self.off_priors(values))) if self.priors else off
 
     def _gathered(self, rows: dict[str, Array]) -> Array:
         """Return the residuals of the curves, stacked on their derivatives, (1 + p, n_data)."""
@@ -365,13 +365,6 @@ class Objective:
                 out[:, at] -= share * out[:, at].mean(axis=1, keepdims=True)
         return out
 
-    def _bounded(self, off: Array, values: Array) -> Array:
-        """Return residuals within the penalty, weighed, with those of the priors."""
-        # The stress may be huge near the pole of branch c.
-        bounded = np.maximum(np.minimum(off, self.penalty), -self.penalty)
-        bounded = bounded if self.weighing is None else self.weighing(bounded)
-        return np.concatenate((bounded, self.off_priors(values))) if self.priors else bounded
-
     def off_priors(self, values: Array) -> Array:
         """Return the deviations of parameters from their priors, in standard deviations."""
         return np.asarray((values[self._prior_places] - self._means) / self._sigmas)
@@ -382,19 +375,15 @@ class Objective:
         It is integrated along with the simulation, and zero if the simulation fails.
         """
         out = np.zeros((self.n_data + len(self.priors), places.size))
-        for row, (sigma, place) in enumerate(zip(self._sigmas, self._prior_places, strict=True)):
-            out[self.n_data + row, places == place] = 1.0 / sigma
+        out[self.n_data :] = (self._prior_places[:, None] == places) / self._sigmas[:, None]
         if not places.size:
             return out
         try:
-            rows, _ = self._simulated(values, places)
+            found = self._gathered(self.simulate(values, places=places).rows)
         except SimulationError:
             return out
-        found = self._gathered(rows)
         slopes = found[1:].T
-        beyond = np.abs(found[0]) >= self.penalty
-        if beyond.any():
-            slopes[beyond] = 0.0
+        slopes[np.abs(found[0]) >= self.penalty] = 0.0
         out[: self.n_data] = slopes if self.weighing is None else self.weighing(slopes)
         return out
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import starmap
 from numbers import Real
 
 import lmfit
@@ -83,14 +84,11 @@ def make_params(
         model = Model.parse(with_options(model, **options), relaxation)
     drive = choose_drive(measurement) if drive is None else drive
     scales = Scales.of(measurement)
-    if model.relaxation and measurement.time is None:
-        raise InputError(
-            f"{measurement.name}: relaxation needs a time column; give one, or leave relaxation out"
-        )
-    if measurement.time is None and (delayed := [law for law in model.laws if law.is_viscous]):
-        raise InputError(
-            f"{measurement.name}: the stress of '{delayed[0].kind}' needs a time column"
-        )
+    wanting = ["relaxation"] if model.relaxation else []
+    wanting += [f"the stress of '{law.kind}'" for law in model.laws if law.is_viscous]
+    if measurement.time is None and wanting:
+        end = "; give one, or leave relaxation out" if model.relaxation else ""
+        raise InputError(f"{measurement.name}: {wanting[0]} needs a time column{end}")
     params, count = lmfit.Parameters(), len(model.kinds)
     fast = drive == "impact"
     on_striker = fast and (count > 1 or balance(measurement).damping is not None)
@@ -150,13 +148,16 @@ def check_fixed_and_varied(
     for name in (*fix, *vary):
         if name in ONLY_IMPACT and name not in names:
             raise InputError(f"'{name}' cannot be fixed or varied here: {ONLY_IMPACT[name]}")
-        if name not in names:
-            raise InputError(
-                f"parameter '{name}' is not one of the model {model}; "
-                f"its parameters are {', '.join(names)}"
-            )
+        _check_known(f"parameter '{name}'", name, model, names)
         if name in fix and name in vary:
             raise InputError(f"parameter '{name}' cannot be both fixed and varied; choose one")
+
+
+def _check_known(what: str, name: str, model: str, names: Iterable[str]) -> None:
+    """Raise InputError if a parameter is not among the `names` of those of a model."""
+    if name not in names:
+        its = ", ".join(names)
+        raise InputError(f"{what} is not one of the model {model}; its parameters are {its}")
 
 
 def _add_heights(params: lmfit.Parameters, measurement: Measurement, model: Model) -> None:
@@ -188,15 +189,16 @@ def _add_nuisance(
         "acceleration": measurement.acceleration is not None,
     }
     free = nuisance.open_in(measurement, drive, counted) | {nuisance.TIME_SHIFT}
+    shows_force = counted["stress"] and (counted["displacement"] or counted["acceleration"])
     usual = nuisance.values_of(measurement)
     if late and drive == "impact":
         usual |= nuisance.aligned(measurement)
     for name in nuisance.names_of(drive, time_shift=late):
         low, high = nuisance.limits_of(name, measurement, drive, scales.duration, late=late)
         origin = measurement.origins.get(name, 0.0)
-        limits = {"min": low + origin, "max": high + origin} if low < high else {}
-        vary = name in free and low < high
-        params.add(name, value=usual[name] + origin, vary=vary, **limits)
+        open_ = low < high and (name != nuisance.FORCE_SCALE or shows_force)
+        limits = {"min": low + origin, "max": high + origin} if open_ else {}
+        params.add(name, value=usual[name] + origin, vary=name in free and open_, **limits)
 
 
 def _counted_from(
@@ -288,10 +290,9 @@ class Problem:
 
     def holding(self, name: str, value: float) -> Problem:
         """Return the problem with a varied parameter fixed at a value; unchanged if it is fixed."""
-        if name not in self.free():
-            return self
         params = self.params.copy()
-        params[name].set(value=value, vary=False)
+        if name in self.free():
+            params[name].set(value=value, vary=False)
         return replace(self, params=params)
 
     def keeping(self, shown: Mapping[str, nuisance.Prior]) -> Problem:
@@ -358,27 +359,21 @@ class Problem:
 
 
 def _copied(params: lmfit.Parameters) -> lmfit.Parameters:
-    """Return a copy, as the caller's must not change; InputError if an expression has no value."""
+    """Return a copy, as the caller's must not change; InputError for a wrong expression."""
     try:
         own = params.copy()
         values = own.valuesdict()
     except (ArithmeticError, NameError, RecursionError, TypeError, ValueError) as error:
         raise InputError(f"an expression of params cannot be evaluated: {error}") from None
-    for name, value in values.items():
-        if own[name].expr and not np.isfinite(value):
-            raise InputError(f"the expression {name} = {own[name].expr} gives {value}")
-    return own
-
-
-def _check_expressions(params: lmfit.Parameters) -> None:
-    """Raise InputError for an expression with a nuisance parameter."""
-    for name, parameter in params.items():
-        used = {name, *re.findall(r"\w+", parameter.expr)} & {*NUISANCE} if parameter.expr else ()
-        if used:
+    for name, expression in ((name, one.expr) for name, one in own.items() if one.expr):
+        if not np.isfinite(values[name]):
+            raise InputError(f"the expression {name} = {expression} gives {values[name]}")
+        if used := {name, *re.findall(r"\w+", expression)} & {*NUISANCE}:
             raise InputError(
-                f"the expression {name} = {parameter.expr} has {min(used)}, which may be held "
+                f"the expression {name} = {expression} has {min(used)}, which may be held "
                 "where the record shows it; only parameters of springs may be in an expression"
             )
+    return own
 
 
 def _check_held(params: lmfit.Parameters) -> None:
@@ -407,16 +402,6 @@ def _check_strain(params: lmfit.Parameters, measurement: Measurement) -> None:
             f"displacement_zero = {zero.value + origin:g} m is not admissible: the measured strain "
             f"would reach {strain:.3g}; it must be larger than {least:g} m"
         )
-
-
-def _prior(name: str, value: object, model: Model) -> nuisance.Prior:
-    """Read a prior of a parameter of a model."""
-    if name not in (*NUISANCE, *model.names):
-        raise InputError(
-            f"priors: {name} is not one of the model {model.name}; its parameters are "
-            f"{', '.join(model.names)}"
-        )
-    return prior_of(name, value)
 
 
 def prior_of(name: str, value: object) -> nuisance.Prior:
@@ -478,21 +463,19 @@ def make_problem(
         interior_mass = False
     chosen = default_weights(measurement, drive, count) if weights is None else dict(weights)
     time_shift = nuisance.is_late(measurement, time_shift=time_shift)
+    for name in [name for name in priors or {} if name not in NUISANCE]:
+        _check_known(f"priors: {name}", name, model.name, model.names)
+    given = tuple(starmap(prior_of, (priors or {}).items()))
     objective = Objective(
-        measurement, model, drive, chosen,
-        interior_mass=interior_mass, time_shift=time_shift,
-        given=tuple(_prior(name, value, model) for name, value in (priors or {}).items()),
+        measurement, model, drive, chosen, interior_mass=interior_mass, time_shift=time_shift,
+        given=given,
     )  # fmt: skip
     measurement = objective.measurement  # it has the noise of each channel
     wanted = make_params(measurement, model, drive, time_shift=time_shift)
     params = lmfit.Parameters() if params is None else _copied(params)
-    if unknown := [name for name in params if name not in wanted]:
-        raise InputError(
-            f"parameter '{unknown[0]}' is not one of the model {model.name}; "
-            f"its parameters are {', '.join(wanted)}"
-        )
     limits = {name: (one.min, one.max) for name, one in wanted.items() if name in NUISANCE}
     for name in params:
+        _check_known(f"parameter '{name}'", name, model.name, wanted)
         wanted[name] = params[name]
     for name, (low, high) in limits.items():
         if wanted[name].vary and not math.isfinite(wanted[name].max - wanted[name].min):
@@ -502,7 +485,7 @@ def make_problem(
                     "has nothing that would show it; leave it fixed"
                 )
             wanted[name].set(min=low, max=high)
-    _check_expressions(wanted)
+
     _counted_from(wanted, measurement.origins, -1.0)
     _check_held(wanted)
     _check_strain(wanted, measurement)

@@ -55,7 +55,6 @@ OF_NUISANCE = {
 class Wanted(NamedTuple):
     """Derivatives to return, by the places of their parameters in the flat vector."""
 
-    size: int
     own: Places  # rows of the derivatives by parameters of springs
     directions: Places  # of the solver: those of springs, then those of nuisance parameters
     others: tuple[tuple[int, str], ...]  # rows and names of nuisance parameters
@@ -170,10 +169,8 @@ class Scenes:
     def moved_by(self, change: Array | float) -> Scenes:
         """Return the scenes with a changed driving motion."""
         other = copy(self)
-        other.plans = {
-            damped: plan._replace(values=plan.values + change)
-            for damped, plan in self.plans.items()
-        }
+        pairs = self.plans.items()
+        other.plans = {key: plan._replace(values=plan.values + change) for key, plan in pairs}
         return other
 
     def _loading(self) -> Drive:
@@ -227,7 +224,7 @@ class Scenes:
                 (self.model.directions[places[own]], np.reshape(given, (-1, 2)).astype(np.int64))
             )
             site = tuple(r for r, p in enumerate(places[own].tolist()) if p == len(names) - 1)
-            found = Wanted(places.size, own, directions, others, columns, damped, site)
+            found = Wanted(own, directions, others, columns, damped, site)
             self._asked[key] = found
         return found
 
@@ -247,13 +244,12 @@ class Scenes:
         curves, motion = self._curves(springs, at, wanted, counted, everything)
         if not wanted.others:
             return curves, motion
-        out = {name: np.empty((1 + wanted.size, rows.shape[1])) for name, rows in curves.items()}
-        own = wanted.own.size
-        for name, rows in curves.items():
-            out[name][0], out[name][1 + wanted.own] = rows[0], rows[1 : 1 + own]
-        for row, name in wanted.others:
-            for curve, rows in curves.items():
-                out[curve][1 + row] = self._by_nuisance(name, curve, rows, at, wanted)
+        out = dict[str, Array]()
+        for curve, rows in curves.items():
+            out[curve] = every = np.empty((1 + places.size, rows.shape[1]))
+            every[0], every[1 + wanted.own] = rows[0], rows[1 : 1 + wanted.own.size]
+            for row, name in wanted.others:
+                every[1 + row] = self._by_nuisance(name, curve, rows, at, wanted)
         return out, motion
 
     def _by_nuisance(
@@ -374,10 +370,8 @@ class Scenes:
     def _averaged(self, motion: Motion, contact: float) -> Motion:
         """Return a simulated motion at the times of the samples."""
         if not self._plain:
-            motion = motion._replace(
-                displacement=self._sampled(motion.displacement),
-                base_stress=self._sampled(motion.base_stress),
-            )
+            moved, stress = self._sampled(motion.displacement), self._sampled(motion.base_stress)
+            motion = motion._replace(displacement=moved, base_stress=stress)
         if self._earlier:
             of_cycle = motion.switches[:, 0] > self.clock[self._earlier - 1]
             motion = motion._replace(switches=motion.switches[of_cycle])
@@ -405,9 +399,8 @@ class Scenes:
         out = np.array([read(row, late) for row in rows])
         if column is not None:
             step = STEP_OF_TIME * float(np.median(np.diff(self.time)))
-            out[1 + column] = (read(rows[0], late + step) - read(rows[0], late - step)) / (
-                2.0 * step
-            )
+            before, after = (read(rows[0], late + side) for side in (-step, step))
+            out[1 + column] = (after - before) / (2.0 * step)
         return out
 
     def _acceleration(

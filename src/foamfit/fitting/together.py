@@ -8,9 +8,9 @@ rate law (`fitting.links`).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,36 +29,19 @@ from foamfit.springs.parameters import NUISANCE
 ENOUGH, ITERATIONS = 1e-5, 80
 # Number of blocks of a curve; noise averages out in each, so that an error of the law shows.
 BLOCKS = 50
-# Largest number of tests whose own values are tried as start values for all tests.
-MOST_STARTS = 4
 # Least value whose logarithm is taken, and the largest logarithm.
 _TINY, _FAR = 1e-30, 100.0
 
 
-@dataclass(frozen=True)
-class Rate:
-    """A coordinate of one test that follows a rate law."""
+def _by_rate(
+    kind: str, x: float, logarithmic: bool, v: float, b: float
+) -> tuple[float, float, float]:
+    """Return a coordinate that follows a rate law, and its derivatives by v and b.
 
-    at: int  # Index among the coordinates of the test
-    kind: str  # One of `RATES`
-    x: float  # ln(rate/rate0) of the test
-    logarithmic: bool  # Whether the coordinate is the logarithm of the parameter
-
-    def value(self, v: float, b: float) -> tuple[float, float, float]:
-        """Return the coordinate and its derivatives by the coordinate v at rate0 and by b."""
-        f, slope = factor(self.kind, b, self.x)
-        if self.logarithmic:
-            return v + float(np.log(f)), 1.0, slope / f
-        return v * f, f, v * slope
-
-
-@dataclass(frozen=True)
-class Pull:
-    """The residual between a scattering parameter of one test and its common value."""
-
-    place: int  # Index in the vector of parameters
-    common: int  # Index of the coordinate ln(common value)
-    weight: float  # Square root of the weight
+    v is the coordinate at rate0; it may be the logarithm of the parameter.
+    """
+    f, slope = factor(kind, b, x)
+    return (v + math.log(f), 1.0, slope / f) if logarithmic else (v * f, f, v * slope)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,35 +49,41 @@ class Term:
     """One test in a sum of squares.
 
     `places` are the indices of its coordinates (in the box `space`) among all coordinates. The
-    slope b of a rate law follows directly after the value at rate0.
+    slope b of a rate law follows directly after the value at rate0. Each scattering parameter has
+    a residual, its pull: its logarithm minus that of the common value, times `weights`.
     """
 
     objective: Objective
     space: Space
     names: tuple[str, ...]  # Parameter of each coordinate
     places: NDArray[np.intp]
-    rates: tuple[Rate, ...]
-    pulls: tuple[Pull, ...]
+    # The rate laws of some coordinates, by their index; see `_by_rate`
+    rates: Mapping[int, Callable[[float, float], tuple[float, float, float]]]
+    pulled: NDArray[np.intp]  # Indices of the scattering parameters in the vector of parameters
+    commons: NDArray[np.intp]  # Indices of the coordinates ln(common value)
+    weights: Array
 
     @property
     def size(self) -> int:
         """Number of residuals of the test, including priors and pulls."""
-        return self.objective.n_data + len(self.objective.priors) + len(self.pulls)
+        return self.objective.n_data + len(self.objective.priors) + self.pulled.size
 
     @cached_property
     def all_places(self) -> NDArray[np.intp]:
         """Indices of all coordinates on which the residual depends."""
-        slopes = [self.places[rate.at] + 1 for rate in self.rates]
-        return np.array([*self.places, *slopes, *(pull.common for pull in self.pulls)], np.intp)
+        return np.array([*self.places, *self.slopes, *self.commons], np.intp)
+
+    @property
+    def slopes(self) -> list[int]:
+        """Indices of the slopes of rate laws."""
+        return [int(self.places[at]) + 1 for at in self.rates]
 
     def _at(self, point: Array) -> tuple[Array, Array]:
         """Return the point of the test's box, and its derivative by `all_places`."""
         own = point[self.places]
         through = np.eye(own.size, self.all_places.size)
-        for j, rate in enumerate(self.rates):
-            at, slope = rate.at, own.size + j
-            found = rate.value(own[at], point[self.places[at] + 1])
-            own[at], through[at, at], through[at, slope] = found
+        for j, (at, law) in enumerate(self.rates.items(), own.size):
+            own[at], through[at, at], through[at, j] = law(own[at], point[self.places[at] + 1])
         return own, through
 
     def values(self, point: Array) -> Array:
@@ -107,23 +96,18 @@ class Term:
         found = self.objective.residual(values)
         if self.objective.failures > failures:
             found = np.full(found.size, np.inf)
-        off = [
-            pull.weight * (_logarithm(values[pull.place]) - point[pull.common])
-            for pull in self.pulls
-        ]
-        return np.append(found, off) if off else found
+        off = self.weights * (_logarithm(values[self.pulled]) - point[self.commons])
+        return np.append(found, off)
 
     def jacobian_at(self, point: Array) -> Array:
         """Return the derivative of `residual_at` by the coordinates in `all_places`, (n, c)."""
         own, through = self._at(point)
         values = self.space.decode(own)
         moves = self.space.slopes(own, values) @ through
-        rows = np.zeros((len(self.pulls), moves.shape[1]))
-        first = self.places.size + len(self.rates)
-        for j, pull in enumerate(self.pulls):
-            if abs(value := values[pull.place]) > _TINY:
-                rows[j] = pull.weight * moves[pull.place] / value
-                rows[j, first + j] -= pull.weight
+        seen = np.abs(pulled := values[self.pulled]) > _TINY
+        rows = moves[self.pulled] / np.where(seen, pulled, 1.0)[:, None]
+        rows[:, own.size + len(self.rates) :] -= np.eye(pulled.size)
+        rows *= np.where(seen, self.weights, 0.0)[:, None]
         return np.vstack([self.objective.jacobian_along(values, moves), rows])
 
 
@@ -154,13 +138,20 @@ class Together:
         own = _varying(problems)
         return cls(tuple(problems), Links({}), (), own, tuple(values), costs, {})
 
-    def starts(self, most: int = MOST_STARTS) -> list[list[Array]]:
-        """Return start values for other links: these values, and the values of one test for all."""
+    def starts(self, most: int) -> list[list[Array]]:
+        """Return start values for other links: these values, and those of one test for all.
+
+        `most` is the largest number of tests whose values are tried for all.
+        """
         count = len(self.values)
         chosen = np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
-        pairs = list(zip(self.problems, self.values, strict=True))
-        one_for_all = ([p.with_springs(self.values[t], own) for p, own in pairs] for t in chosen)
+        one_for_all = ([p.with_springs(self.values[t], v) for p, v in self.pairs] for t in chosen)
         return [list(self.values), *one_for_all]
+
+    @property
+    def pairs(self) -> list[tuple[Problem, Array]]:
+        """Each test with its parameters."""
+        return list(zip(self.problems, self.values, strict=True))
 
     @cached_property
     def n_eff(self) -> int:
@@ -191,18 +182,12 @@ class Together:
     @cached_property
     def misfits(self) -> tuple[dict[str, float | None], ...]:
         """Misfit of each curve of each test, RMS over the measured range."""
-        return tuple(
-            problem.objective.misfit(problem.objective.simulate(values, everything=True))
-            for problem, values in zip(self.problems, self.values, strict=True)
-        )
+        pairs = [(problem.objective, values) for problem, values in self.pairs]
+        return tuple(one.misfit(one.simulate(values, everything=True)) for one, values in pairs)
 
     def value(self, name: str) -> list[float]:
         """Return the values of one parameter in the tests that have it."""
-        return [
-            float(values[problem.index[name]])
-            for problem, values in zip(self.problems, self.values, strict=True)
-            if name in problem.index
-        ]
+        return [float(values[p.index[name]]) for p, values in self.pairs if name in p.index]
 
 
 def fit_linked(
@@ -221,15 +206,12 @@ def fit_linked(
     start can be simulated.
     """
     layout = _Layout.of(tuple(problems), links)
-    ends = list[levenberg.Iterate]()
-    for vectors in starts:
-        start = layout.start(vectors)
-        if np.all(np.isfinite(layout.residual(start))):
-            ends.append(
-                levenberg.descend(
-                    layout.residual, layout.jacobian, start, layout.box, iterations, enough=ENOUGH
-                )
-            )
+    functions = layout.residual, layout.jacobian
+    ends = [
+        levenberg.descend(*functions, start, layout.box, iterations, enough=ENOUGH)
+        for start in map(layout.start, starts)
+        if np.all(np.isfinite(layout.residual(start)))
+    ]
     if not ends:
         raise SimulationError(
             f"{problems[0].measurement.name}: no start of the fit of {len(problems)} tests can be "
@@ -239,7 +221,7 @@ def fit_linked(
     parts = np.split(best.residual, np.cumsum([term.size for term in layout.terms])[:-1])
     values = tuple(term.values(best.point) for term in layout.terms)
     costs = tuple(
-        float(np.sum(part[: part.size - len(term.pulls)] ** 2))
+        float(np.sum(part[: part.size - term.pulled.size] ** 2))
         for part, term in zip(parts, layout.terms, strict=True)
     )
     shared, common = layout.shared, layout.common(best.point, values)
@@ -273,7 +255,7 @@ def _varying(problems: Sequence[Problem]) -> tuple[str, ...]:
     return tuple(name for name in (*first.model.names, *NUISANCE) if name in free)
 
 
-def _spaces(problems: Sequence[Problem], absolute: Sequence[str]) -> list[Space]:
+def _spaces(problems: Sequence[Problem], absolute: tuple[str, ...]) -> list[Space]:
     """Return the boxes of the tests, with common scales and limits."""
     every, spaces = [problem.scales for problem in problems], [one.space() for one in problems]
     scales = Scales(
@@ -286,16 +268,10 @@ def _spaces(problems: Sequence[Problem], absolute: Sequence[str]) -> list[Space]
     count = len(problems[0].model.names)  # limits of nuisance parameters differ
     low = np.min([space.low[:count] for space in spaces], axis=0)
     high = np.max([space.high[:count] for space in spaces], axis=0)
-    return [
-        replace(
-            space,
-            scales=scales,
-            absolute=tuple(absolute),
-            low=np.append(low, space.low[count:]),
-            high=np.append(high, space.high[count:]),
-        )
-        for space in spaces
-    ]
+    for i, one in enumerate(spaces):
+        ends = np.append(low, one.low[count:]), np.append(high, one.high[count:])
+        spaces[i] = replace(one, scales=scales, absolute=absolute, low=ends[0], high=ends[1])
+    return spaces
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,43 +292,36 @@ class _Layout:
         kinds = {name: links.kind(name) for name in names}
         own = tuple(name for name in names if kinds[name] in ("own", "scatter"))
         shared = {name for name in names if kinds[name] == "shared"}
-        absolute = [
-            name
-            for name in names
-            if name not in own
-            and (parents := _parents(problems[0], name) & set(names))
-            and (parents - shared or kinds[name] in RATES)
-        ]
+        rated = {name for name in names if kinds[name] in RATES}
+        parents = {n: _parents(problems[0], n) & set(names) for n in names if n not in own}
+        absolute = tuple(n for n, of in parents.items() if of - shared or (of and n in rated))
         places, count = dict[str, int](), 0
         for name in names:
             if kinds[name] != "own":
                 places[name] = count
-                count += 2 if kinds[name] in RATES else 1
+                count += 2 if name in rated else 1
         terms = list[Term]()
-        for t, (problem, space) in enumerate(
-            zip(problems, _spaces(problems, absolute), strict=True)
-        ):
-            at, rates = list[int](), list[Rate]()
+        pairs = zip(problems, _spaces(problems, absolute), strict=True)
+        for t, (problem, space) in enumerate(pairs):
+            at, rates = list[int](), dict[int, partial[tuple[float, float, float]]]()
             coordinates = {problem.names[one.place]: one for one in space.coordinates}
             for j, (name, one) in enumerate(coordinates.items()):
                 at.append(count if name in own else places[name])
                 count += name in own
-                if kinds[name] in RATES:
-                    rates.append(Rate(j, kinds[name], links.x(t), one.is_logarithmic))
-            pulls = tuple(
-                Pull(problem.index[name], places[name], float(pull[t]))
-                for name, pull in links.pulls.items()
-                if name in places and name in problem.free() and pull[t]
-            )
-            named, at_all = tuple(coordinates), np.array(at, np.intp)
-            terms.append(Term(problem.objective, space, named, at_all, tuple(rates), pulls))
+                if name in rated:
+                    rates[j] = partial(_by_rate, kinds[name], links.x(t), one.is_logarithmic)
+            free = places.keys() & problem.free()
+            pulls = {n: pull[t] for n, pull in links.pulls.items() if n in free and pull[t]}
+            pulled = np.array([problem.index[name] for name in pulls], np.intp)
+            commons = np.array([places[name] for name in pulls], np.intp)
+            given = problem.objective, space, tuple(coordinates), np.array(at, np.intp)
+            terms.append(Term(*given, rates, pulled, commons, np.array([*pulls.values()])))
         box = np.full(count, -_FAR), np.full(count, _FAR)
         for term in terms:
             for side, ends, steepest in zip(
                 box, term.space.box, (-STEEPEST, STEEPEST), strict=True
             ):
-                side[term.places] = ends
-                side[[term.places[rate.at] + 1 for rate in term.rates]] = steepest
+                side[term.places], side[term.slopes] = ends, steepest
         return cls(problems, links, own, places, tuple(terms), box)
 
     @property
@@ -382,8 +351,8 @@ class _Layout:
         for name, place in self.common_places.items():
             free = [t for t, problem in enumerate(self.problems) if name in problem.free()]
             if name in self.own:
-                values = (vectors[t][self.problems[t].index[name]] for t in free)
-                point[place] = np.median([_logarithm(value) for value in values])
+                values = [vectors[t][self.problems[t].index[name]] for t in free]
+                point[place] = np.median(_logarithm(np.array(values)))
                 continue
             columns = [self.terms[t].names.index(name) for t in free]
             own = np.array([found[t][j] for t, j in zip(free, columns, strict=True)])
@@ -413,9 +382,9 @@ class _Layout:
         return out
 
 
-def _logarithm(value: float) -> float:
-    """Return the logarithm of the absolute value of a parameter."""
-    return float(np.log(max(abs(value), _TINY)))
+def _logarithm(values: Array) -> Array:
+    """Return the logarithms of the absolute values of parameters."""
+    return np.log(np.maximum(np.abs(values), _TINY))
 
 
 def _parents(problem: Problem, name: str) -> set[str]:

@@ -7,7 +7,7 @@ Content of files is always shown as escaped text.
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
@@ -19,34 +19,11 @@ import panel as pn
 
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
+from foamfit.page import desk as desks
+from foamfit.page import inputs as ui
 from foamfit.page.curves import Curves, misfits_text
-from foamfit.page.desk import (
-    BUSY,
-    LARGEST,
-    QUANTITIES,
-    SAVED_TOML,
-    Desk,
-    Preview,
-    preview,
-    remedies,
-    wrong_quantity,
-)
-from foamfit.page.inputs import (
-    OF_CURVES,
-    STYLE,
-    TEMPLATES,
-    WIDE,
-    Inputs,
-    button,
-    grid,
-    models,
-    piece,
-    soft,
-    text,
-    wrong,
-)
 from foamfit.page.turning import Turning
-from foamfit.page.worker import FirstUse, News, parsed
+from foamfit.page.worker import FirstUse, News, Worker, parsed
 from foamfit.parts import law_in_words
 from foamfit.report.folder import load_result
 from foamfit.springs.model import Model
@@ -68,32 +45,32 @@ class Window:
     """The page in one browser window; windows share nothing."""
 
     def __init__(
-        self, desk: Desk, test: Path | None, first_use: FirstUse, gone: Callable[[], None]
+        self, desk: desks.Desk, test: Path | None, first_use: FirstUse, gone: Callable[[], None]
     ) -> None:
         self.desk, self.first_use, self.curves = desk, first_use, Curves()
         self._shown: object = None
         self._asked = {READING: 0, PREPARING: 0}
-        self.received, self.problem, self.progress, self.compiling = (text() for _ in range(4))
-        self.understood, self.ending, self.misfit, self.report = (text() for _ in range(4))
-        self.understood.object = soft("There is no test yet.")
-        self.ending.object = soft("There is no fit yet.")
-        self.inputs = Inputs(self._edited, self._model_chosen, self._refuse)
+        self.received, self.problem, self.progress, self.compiling = (ui.text() for _ in range(4))
+        self.understood, self.ending, self.misfit, self.report = (ui.text() for _ in range(4))
+        self.understood.object = ui.soft("There is no test yet.")
+        self.ending.object = ui.soft("There is no fit yet.")
+        self.inputs = ui.Inputs(self._edited, self._model_chosen, self._refuse)
         self.upload = pn.widgets.FileDropper(
-            name=f"Drop a CSV here (and its TOML), {LARGEST // 2**20} MB at most",
+            name=f"Drop a CSV here (and its TOML), {desks.LARGEST // 2**20} MB at most",
             multiple=True,
             previews=[],
             height=96,  # the list of files below its label stays hidden
-            **STYLE,
+            **ui.STYLE,
         )
         self.upload.param.watch(self._received, "value")
-        self.example = button("Try an example", lambda _: self._take(EXAMPLE))
-        self.check = button("Check the test", self._check)
-        self.remedies = pn.Column(**WIDE)
-        self.run = button("Fit", self._run, "primary", disabled=True)
-        self.stop = button("Stop, and keep the best", self._stop, "danger", visible=False)
-        self.back = button("Back to the fit", self._back, visible=False)
+        self.example = ui.button("Try an example", lambda _: self._take(EXAMPLE))
+        self.check = ui.button("Check the test", self._check)
+        self.remedies = pn.Column(**ui.WIDE)
+        self.run = ui.button("Fit", self._run, "primary", disabled=True)
+        self.stop = ui.button("Stop, and keep the best", self._stop, "danger", visible=False)
+        self.back = ui.button("Back to the fit", self._back, visible=False)
         self.report_of = pn.widgets.Select(
-            name="Report and curves of cycle", options=[0], visible=False, **STYLE
+            name="Report and curves of cycle", options=[0], visible=False, **ui.STYLE
         )
         self.report_of.param.watch(self._back, "value")
         self.saves = self._saves()
@@ -112,7 +89,7 @@ class Window:
 
     def _template(self) -> Any:
         """Return the page with its parts in their places."""
-        made = pn.Template((TEMPLATES / "page.html").read_text(encoding="utf-8"))
+        made = pn.Template((ui.TEMPLATES / "page.html").read_text(encoding="utf-8"))
         inputs = self.inputs.parts
         parts = inputs | {
             "test": [self.upload, self.received, self.example, *inputs["test"]],
@@ -123,22 +100,11 @@ class Window:
             "result": [self.saves, self.ending, self.report_of, self.report],
         }
         for name, widgets in parts.items():
-            made.add_panel(name, pn.Column(*widgets, **WIDE))
+            made.add_panel(name, pn.Column(*widgets, **ui.WIDE))
         return made
 
     def _saves(self) -> Any:
         """Return the buttons that save parts of a result."""
-
-        def cycle() -> int:
-            return int(self.report_of.value)
-
-        saves: dict[tuple[str, str], Callable[[], bytes]] = {
-            ("the result folder", "result.zip"): lambda: self.desk.zipped(),
-            ("the report", "report.html"): lambda: self._report().encode(),
-            ("the TOML", SAVED_TOML): lambda: self.desk.toml,
-            ("the LS-DYNA card", "card.zip"): lambda: self.desk.card(cycle()),
-            ("the test plan", "plan.html"): lambda: self.desk.planned(cycle()),
-        }
 
         def save(what: str, name: str, content: Callable[[], bytes]) -> Any:
             return pn.widgets.FileDownload(
@@ -147,13 +113,19 @@ class Window:
                 callback=lambda: BytesIO(content()),
                 embed=False,
                 auto=True,
-                **STYLE,
+                **ui.STYLE,
             )
 
-        return grid([save(*one, content) for one, content in saves.items()], 11.0)
+        saves = [
+            save("the result folder", "result.zip", self.desk.zipped),
+            save("the report", "report.html", lambda: self._report().encode()),
+            save("the TOML", desks.SAVED_TOML, lambda: self.desk.toml),
+            save("the LS-DYNA card", "card.zip", lambda: self.desk.card(self.report_of.value)),
+            save("the test plan", "plan.html", lambda: self.desk.planned(self.report_of.value)),
+        ]
+        return ui.grid(saves, 11.0)
 
     def _report(self) -> str:
-        """Return the HTML report of the fit, or of the selected cycle."""
         return (self.desk.fits[self.report_of.value] / "report.html").read_text(encoding="utf-8")
 
     # ------------------------------------------------------------------------------- beside
@@ -161,9 +133,8 @@ class Window:
     def _allow(self) -> None:
         """Enable the Fit button: there is a test, the solver is compiled, and no fit is running."""
         compiled = self.first_use.done.done()
-        self.compiling.object = "" if compiled else piece("busy", COMPILING)
-        ready = self.desk.measurement is not None and compiled
-        self.run.disabled = not ready or self.desk.running
+        self.compiling.object = "" if compiled else ui.piece("busy", COMPILING)
+        self.run.disabled = self.desk.measurement is None or not compiled or self.desk.running
 
     def _beside(
         self, pool: ThreadPoolExecutor, work: Callable[[], Any], then: Callable[[Any], None]
@@ -192,7 +163,7 @@ class Window:
     # ------------------------------------------------------------------------------- the test
 
     def _refuse(self, error: object) -> None:
-        self.problem.object = wrong(error)
+        self.problem.object = ui.wrong(error)
 
     def _received(self, event: Any) -> None:
         """Take the files that were dropped."""
@@ -201,9 +172,9 @@ class Window:
         for name, content in files.items():
             raw = content.encode() if isinstance(content, str) else content  # as Panel decoded it
             try:
-                told = soft(self.desk.receive(name, raw))
+                told = ui.soft(self.desk.receive(name, raw))
             except InputError as error:
-                self.received.object = wrong(error)
+                self.received.object = ui.wrong(error)
                 continue
             if self.desk.dropped is None:  # a TOML fills the fields
                 self.received.object = told
@@ -215,7 +186,7 @@ class Window:
         except (InputError, OSError) as error:
             self._refuse(error)
             return
-        self.received.object = soft(path.name)
+        self.received.object = ui.soft(path.name)
         self._read()
 
     def _read(self) -> None:
@@ -251,23 +222,23 @@ class Window:
 
     def _show_checked(self, found: str | Exception) -> None:
         error = found if isinstance(found, Exception) else ""
-        missing = wrong_quantity(str(error))
+        missing = desks.wrong_quantity(str(error))
         empty = bool(missing) and not self.inputs.quantities[missing].value
         if empty:
-            label, example = QUANTITIES[missing]
-            self.problem.object = soft(PROMPT.format(label.lower(), example))
+            label, example = desks.QUANTITIES[missing]
+            self.problem.object = ui.soft(PROMPT.format(label.lower(), example))
         else:
             self._refuse(error)
         self.inputs.mark("" if empty else missing)
-        if str(error) == BUSY:
+        if str(error) == desks.BUSY:
             self.curves.sliders.waiting = False
             return
         self._offer(str(error))
         if error and (csv := self.desk.csv) is not None:
             rest = self.inputs.rest.value or ""
-            self._beside(READING, lambda: preview(csv, rest), self._show_preview)
+            self._beside(READING, lambda: desks.preview(csv, rest), self._show_preview)
         unread = "The test cannot be read yet; see the error message."
-        self.understood.object = soft(unread) if error else piece("verbatim", found)
+        self.understood.object = ui.soft(unread) if error else ui.piece("verbatim", found)
         if self.desk.measurement is not None:
             self.inputs.show_cycles(len(self.desk.measurement.cycles))
         self._model_chosen()
@@ -275,13 +246,11 @@ class Window:
     def _offer(self, message: str) -> None:
         """Show what a message proposes as buttons."""
         self.remedies[:] = [
-            button(words, partial(self._use, *one)) for words, one in remedies(message).items()
+            ui.button(words, partial(self.inputs.add_column, *one))
+            for words, one in desks.remedies(message).items()
         ]
 
-    def _use(self, channel: str, entry: Mapping[str, Any], event: Any) -> None:
-        self.inputs.add_column(channel, entry)
-
-    def _show_preview(self, found: Preview | Exception) -> None:
+    def _show_preview(self, found: desks.Preview | Exception) -> None:
         """Show the curves of a file whose specimen is not known yet, and its columns."""
         if isinstance(found, Exception):
             return
@@ -289,7 +258,7 @@ class Window:
         if found.why:
             self._offer(found.why)
         if found.picture is not None:
-            self.misfit.object = piece("preview", base64.b64encode(found.picture).decode())
+            self.misfit.object = ui.piece("preview", base64.b64encode(found.picture).decode())
 
     # ------------------------------------------------------------------------------- the curves
 
@@ -299,52 +268,46 @@ class Window:
         self._allow()
         self.inputs.relaxation.disabled, self.curves.sliders.ticks = auto, not auto
         if self.desk.measurement is None:
-            self._hide_curves()
+            self._show_turning("")
             return
         try:
             asked = parsed(self.inputs.arguments())
         except InputError:  # reported when the fit is started
             asked = parsed([])
-        model = models()[1] if auto else self.inputs.model.value
-        self._turn_model(model, self.desk.measurement, **keywords(asked))
-
-    def _hide_curves(self, why: object = "") -> None:
-        self.curves.hide()
-        self.misfit.object = wrong(why)
+        model = ui.models()[1] if auto else self.inputs.model.value
+        self._turn_model(model, self.desk.measurement, asked, {})
 
     def _turn_model(
-        self,
-        model: str,
-        of: Measurement | News,
-        values: Mapping[str, float] | None = None,
-        **options: Any,
+        self, model: str, of: Measurement | News, asked: dict[str, Any], values: dict[str, float]
     ) -> None:
         """Show the sliders of a model, at `values` or at values read off the measured loop.
 
-        `of` gives the cycles: a test, or the report of a fit.
+        `of` gives the cycles: a test, or the report of a fit. `asked` are the options of the fit.
         """
+        options: Any = {one: asked[one] for one in ui.OF_CURVES}
 
         def make() -> Turning:
             self.first_use.done.result()
-            test = self.desk.measured(of.cycle, of.last_cycle)
-            made = Turning(test, model, values, **options)
+            made = Turning(self.desk.measured(of.cycle, of.last_cycle), model, values, **options)
             made.turn({})  # load the compiled code
             return made
 
         self.curves.sliders.waiting = True
         what = f"Preparing the curves of {law_in_words(model, options['relaxation'])} …"
         if self.curves.turning is None and not self.compiling.object:
-            self.misfit.object = piece("busy", what)
+            self.misfit.object = ui.piece("busy", what)
         else:
             self.curves.sliders.tell(what)
         self._beside(PREPARING, make, self._show_turning)
 
-    def _show_turning(self, made: Turning | Exception) -> None:
-        if isinstance(made, Exception):
-            self._hide_curves(made)
-            return
-        self.misfit.object = ""
-        self.curves.show(made)
+    def _show_turning(self, made: Turning | Exception | str) -> None:
+        """Show curves, or hide them and show why there are none."""
+        if isinstance(made, Turning):
+            self.misfit.object = ""
+            self.curves.show(made)
+        else:
+            self.curves.hide()
+            self.misfit.object = ui.wrong(made)
 
     # ------------------------------------------------------------------------------- the fit
 
@@ -357,7 +320,7 @@ class Window:
         try:
             self.desk.fit(arguments)
         except InputError as error:
-            self.progress.object = wrong(error)
+            self.progress.object = ui.wrong(error)
             return
         self.run.disabled, self.stop.visible, self.stop.disabled = True, True, False
         self._hide_result("A fit is running.")
@@ -373,7 +336,7 @@ class Window:
     def _hide_result(self, why: str) -> None:
         self.saves.visible = self.back.visible = self.report_of.visible = False
         self.report.object = ""
-        self.ending.object = soft(why)
+        self.ending.object = ui.soft(why)
 
     def _stop(self, event: Any = None) -> None:
         if self.desk.worker is not None:
@@ -382,13 +345,12 @@ class Window:
 
     def _follow(self) -> None:
         """Show the progress of the fit, and its result when it has ended."""
-        worker = self.desk.worker
-        if worker is None:
+        if (worker := self.desk.worker) is None:
             return
         ended, news = worker.ended, worker.news
         if ended is not None:
             self._poll.stop()
-            self._ended()
+            self._ended(worker)
             return
         if news is self._shown and not worker.stopping:
             return
@@ -398,7 +360,7 @@ class Window:
         told = f"{what}, {share} %"
         if news.misfit:
             told += f"; best misfit {misfits_text(news.misfit)}"
-        self.progress.object = piece("progress", share, told)
+        self.progress.object = ui.piece("progress", share, told)
         self._show_best(news)
 
     def _show_best(self, news: News) -> None:
@@ -417,27 +379,26 @@ class Window:
     def _turn_fitted(self, news: News) -> None:
         """Show the curves of the last fit at the reported values."""
         assert self.desk.worker is not None
-        options = keywords(parsed(self.desk.worker.job.arguments))
-        options |= {"relaxation": news.relaxation, "drive": news.drive}
-        self._turn_model(news.model, news, news.values, **options)
+        asked = parsed(self.desk.worker.job.arguments)
+        asked |= {"relaxation": news.relaxation, "drive": news.drive}
+        self._turn_model(news.model, news, asked, news.values)
 
-    def _ended(self) -> None:
+    def _ended(self, worker: Worker) -> None:
         """Show the result of the fit, or why it failed."""
         self._allow()
         self.stop.visible = False
-        self.progress.object = piece("ended")
+        self.progress.object = ui.piece("ended")
         self._hold(False)
         if self.desk.result is None:
-            self.ending.object = wrong(self.desk.ending())
+            self.ending.object = ui.wrong(self.desk.ending())
             return
-        assert self.desk.worker is not None
-        told, picture = self.desk.worker.told, self.desk.result / "cycles.png"
-        self.ending.object = soft(f"In a terminal: {self.desk.command}")
+        told, picture = worker.told, self.desk.result / "cycles.png"
+        self.ending.object = ui.soft(f"In a terminal: {self.desk.command}")
         if told:
-            self.ending.object += piece("verbatim", told)
+            self.ending.object += ui.piece("verbatim", told)
         if told and picture.is_file():
             png = base64.b64encode(picture.read_bytes()).decode()
-            self.ending.object += piece("cycles", png)
+            self.ending.object += ui.piece("cycles", png)
         fits = [*self.desk.fits]
         self.saves.visible = True
         self.back.visible, self.report_of.visible = bool(fits), len(fits) > 1
@@ -447,21 +408,15 @@ class Window:
 
     def _back(self, event: Any = None) -> None:
         """Show the report of the fit, and move the sliders back to its values."""
-        cycle = self.report_of.value
-        if cycle not in self.desk.fits:
+        if (cycle := self.report_of.value) not in self.desk.fits:
             return
-        self.report.object = piece("report", self._report())
+        self.report.object = ui.piece("report", self._report())
         fit = load_result(self.desk.fits[cycle])
         self.curves.found = fit["parameters"]
         values = {name: one["value"] for name, one in fit["parameters"].items()}
         place = {name: fit[name] for name in ("relaxation", "drive")}
         place |= {name: fit["data"][name] for name in ("cycle", "last_cycle")}
         self._turn_fitted(News(values=values, model=Model.of_result(fit).name, **place))
-
-
-def keywords(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options that change the curves of a model."""
-    return {one: asked[one] for one in OF_CURVES}
 
 
 def send_at_once() -> None:

@@ -62,7 +62,7 @@ class Curves:
         """Show another model or test, with its sliders."""
         self.turning = turning
         self._rows = {row.name: row for row in turning.rows}
-        self._show_measured()
+        self._show_measured(turning)
         self.sliders.rows = [
             vars(row) | {"held": self.held.get(row.name, row.held)} | self._spans(row)
             for row in turning.rows
@@ -134,11 +134,10 @@ class Curves:
         made.toolbar.autohide = True
         return made
 
-    def _show_measured(self) -> None:
-        assert self.turning is not None
+    def _show_measured(self, turning: Turning) -> None:
         for name, made in self._figures.items():
-            measured = self.turning.measured.get(name)
-            if name == "displacement_time" and self.turning.drive == "displacement":
+            measured = turning.measured.get(name)
+            if name == "displacement_time" and turning.drive == "displacement":
                 measured = None  # it is the input
             self._panes[name].visible = measured is not None
             if measured is None:

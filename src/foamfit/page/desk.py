@@ -118,8 +118,7 @@ class Desk:
         """
         known = csv.suffix.lower() in ENDINGS
         self.receive(csv.name if known else f"{csv.stem}.csv", csv.read_bytes())
-        toml = toml_beside(csv)
-        if toml.is_file():
+        if (toml := toml_beside(csv)).is_file():
             self.dropped = toml.read_bytes()
 
     def dropped_toml(self) -> tuple[dict[str, str], str] | None:
@@ -195,8 +194,7 @@ class Desk:
         folder = self.folder / f"fit-{self._fits}"
         toml = folder.with_suffix(".toml")  # the page may change it later
         toml.write_bytes(self.toml)
-        job = Job(self.csv, toml, folder, arguments)
-        self.worker = Worker(job)
+        self.worker = Worker(Job(self.csv, toml, folder, arguments))
         return self.worker
 
     @property
@@ -207,9 +205,7 @@ class Desk:
     @property
     def result(self) -> Path | None:
         """The folder of the last fit, if it has one."""
-        if self.worker is None or self.worker.ended != "":
-            return None
-        return self.worker.job.folder
+        return None if self.worker is None or self.worker.ended != "" else self.worker.job.folder
 
     @property
     def fits(self) -> dict[int, Path]:
@@ -221,8 +217,7 @@ class Desk:
 
     def ending(self) -> str:
         """Return why the last fit has no result, or "" if it has one."""
-        assert self.worker is not None
-        return self._plain(self.worker.ended or "")
+        return self._plain((self.worker and self.worker.ended) or "")
 
     @property
     def command(self) -> str:
@@ -279,9 +274,6 @@ def safe_name(name: str) -> str:
     if not stem:
         stem, dot, suffix = name or "test", "", ""
     return f"{stem[: LONGEST - 10]}{dot}{suffix[:8]}"
-
-
-# ------------------------------------------------------------------------------------ the TOML
 
 
 def split_toml(text: str) -> tuple[dict[str, str], str]:
@@ -364,10 +356,10 @@ def _picture(csv: Path, toml: Path, strained: bool) -> bytes:
     if test.stress is None:
         raise InputError("there is no force to draw")
     motion = ("strain", "–") if strained else ("displacement", "m")
-    for x, name, unit in ((test.time, "time", "s"), (test.displacement, *motion)):
+    for x, axis in ((test.time, ("time", "s")), (test.displacement, motion)):
         if x is not None:
-            style = {"color": figures.BLUE, "lw": 0.9}
-            panels.append(Panel(name, name, unit, "force", "N", [Line(x, test.stress, "", style)]))
+            line = Line(x, test.stress, "", {"color": figures.BLUE, "lw": 0.9})
+            panels.append(Panel(axis[0], axis, ("force", "N"), [line]))
     with figures.drawing(7.0, 2.6) as figure:
         axes = figures.grid_of(figure, 1, max(len(panels), 1), len(panels))
         for ax, panel in zip(axes, panels, strict=True):

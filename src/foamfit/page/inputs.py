@@ -53,9 +53,7 @@ def soft(text: str) -> str:
 def wrong(error: object) -> str:
     """Return an error as a paragraph, "" for none; unexpected errors are called defects."""
     text = str(error)
-    if isinstance(error, Exception) and not isinstance(
-        error, InputError | SimulationError | OSError
-    ):
+    if not isinstance(error, str | InputError | SimulationError | OSError):
         text = f"This is a defect of foamfit, please report it ({type(error).__name__}: {error})."
     return piece("paragraph", text, "error") if text else ""
 
@@ -130,8 +128,7 @@ class Field:
 
     def arguments(self) -> list[str]:
         """Return the arguments for the value filled in; none for the default."""
-        value = self.widget.value
-        if isinstance(value, list):
+        if isinstance(value := self.widget.value, list):
             return [self.flag] if value else []
         text = "" if value is None else str(value).strip()
         return [] if text in ("", str(self.default)) else [self.flag, text]
@@ -140,11 +137,7 @@ class Field:
 # Options shown at once, and options folded away; tick boxes stand for --fix and --vary.
 CYCLES = ("cycle", "cycles")  # shown if a record has several
 SHOWN = ("model", "drive", "relaxation", *CYCLES)
-FOLDED = (
-    *FREED,
-    *("starts", "max_time", "seed", "interior_mass", "time_shift"),
-    *("profile", "mcmc"),
-)
+FOLDED = (*FREED, "starts", "max_time", "seed", "interior_mass", "time_shift", "profile", "mcmc")
 # Options that change the curves of a model.
 OF_CURVES = ("drive", "relaxation", "interior_mass", "time_shift", *FREED)
 WRONG = FIELD + ".bk-input { border: 2px solid #b3261e; background: var(--bad); }"
@@ -253,7 +246,7 @@ class Inputs:
                 column.param.update(options=["", *headers], value="")
         self._filling = False
 
-    def add_column(self, channel: str, entry: Mapping[str, Any]) -> None:
+    def add_column(self, channel: str, entry: Mapping[str, Any], event: Any = None) -> None:
         """Enter an entry of [columns] into the further TOML."""
         try:
             self.rest.value = with_column(self.rest.value or "", channel, entry)

@@ -124,10 +124,8 @@ class Turning:
         without_time = found.get("stress_strain")  # simulated along the measured motion
         stress = m.stress if drive == "stress" else found.get("stress_time", without_time)
         moved = m.displacement if drive == "displacement" else found.get("displacement_time")
-        panels = self._panels(stress, moved)
-        curves = {n: xy for n, xy in panels.items() if n in self.measured}
-        alone = len(springs) == 1 and not problem.model.relaxation
-        points = springs[0].corners if alone else {}
+        curves = {n: xy for n, xy in self._panels(stress, moved).items() if n in self.measured}
+        points = springs[0].corners if len(springs) == 1 and not problem.model.relaxation else {}
         return Drawn(curves, problem.objective.misfit(simulated), points)
 
     @cached_property
@@ -151,21 +149,16 @@ class Turning:
         starts = curve_starts(space, thinned(problem.measurement, loop=True), rng)
         tracker = Tracker(problem.objective)
         rank(tracker, space, starts)
-        found = problem.vector() if tracker.best_values is None else tracker.best_values
-        return np.asarray(found)
+        return np.asarray(problem.vector() if tracker.best_values is None else tracker.best_values)
 
     def _row(self, name: str) -> Row:
-        problem = self.problem
-        value = float(self.values[problem.index[name]])
-        parameter = problem.params[name]
-        unit = unit_of(name)
-        factor, shown = readable_unit(value, unit)
+        parameter = self.problem.params[name]
+        value = float(self.values[self.problem.index[name]])
+        factor, shown = readable_unit(value, unit_of(name))
         far = WIDE * value or 0.1 * (parameter.max if parameter.max > 0 else parameter.min)
         low, high = sorted((0.0, far))
         if split_name(name)[1] == "time_shift":
             low, high = parameter.min, parameter.max
-        low, high = max(low, parameter.min), min(high, parameter.max)
-        value, low, high, least, most = (
-            one / factor for one in (value, low, high, parameter.min, parameter.max)
-        )
+        ends = max(low, parameter.min), min(high, parameter.max), parameter.min, parameter.max
+        value, low, high, least, most = (one / factor for one in (value, *ends))
         return Row(name, shown, factor, value, low, high, least, most, held=not parameter.vary)

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from foamfit.cli.progress import APART, Watcher
 from foamfit.errors import InputError, SimulationError, as_signalled
+from foamfit.options import OPTIONS
 from foamfit.solve import cache
 from foamfit.solve.precompile import LOOPS, compile_solver
 from foamfit.springs import laws
@@ -96,12 +97,10 @@ class Worker:
         self.process.join()
 
     def _listen(self) -> None:
-        """Read the reports of the process until it ends."""
         done: str | None = None
         with suppress(EOFError, OSError):
             while done is None:
-                report = self._pipe.recv()
-                if isinstance(report, News):
+                if isinstance(report := self._pipe.recv(), News):
                     self.news = report
                 else:
                     done, self.told = report
@@ -168,7 +167,6 @@ class _Teller(Watcher):
 
     def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
         """Report the parameters and misfits of the best point so far."""
-        named = zip(problem.names, (values + problem.origins).tolist(), strict=True)
         self.news = replace(
             self.news,
             model=problem.model.name,
@@ -176,7 +174,7 @@ class _Teller(Watcher):
             drive=problem.objective.drive,
             cycle=problem.measurement.cycle,
             last_cycle=problem.measurement.last_cycle,
-            values=dict(named),
+            values=dict(zip(problem.names, (values + problem.origins).tolist(), strict=True)),
             misfit=misfit,
         )
         self._say()
@@ -191,7 +189,6 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
     import click
 
     from foamfit.cli.fit import fit as command
-    from foamfit.cli.options import Output
 
     # A browser must not name a law file, because law files are code.
     own = click.Command("fit", params=[one for one in command.params if one.name != "law"])
@@ -199,10 +196,8 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
         context = own.make_context("fit", ["TEST.csv", *arguments])
     except click.ClickException as error:
         raise InputError(error.format_message()) from None
-    others = {"test", "specimen", "force", "verbose", *Output.__dataclass_fields__} - {
-        "figure_width"
-    }
-    return {name: value for name, value in context.params.items() if name not in others}
+    kept = OPTIONS.keys() - {"specimen"} | {"figure_width"}
+    return {name: value for name, value in context.params.items() if name in kept}
 
 
 def _fitted(job: Job, teller: _Teller) -> tuple[str, str]:
@@ -230,7 +225,6 @@ def _fitted(job: Job, teller: _Teller) -> tuple[str, str]:
 
 
 def _wait_for_stop(pipe: Connection) -> None:
-    """Interrupt the main thread when a message says so."""
     with suppress(EOFError, OSError):
         if pipe.recv() == STOP:
             _thread.interrupt_main()

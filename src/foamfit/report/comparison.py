@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,39 +52,37 @@ class Row:
     """One quantity and its reference, in the paper's unit ("s2 k_h+/k0", "" or "k0", "MPa").
 
     The state of a ratio is the worst of its parts. A published `reference` has no standard error.
-    `remark` is the reason why value and reference are not compared, or "".
+    `remark` is the reason why the two are not compared, or "".
     """
 
     label: str
     unit: str
-    value: float
-    stderr: float | None
-    state: str
-    reference: float | None
-    reference_stderr: float | None
+    fitted: ParameterEstimate
+    reference: ParameterEstimate | None
     remark: str
 
     @property
     def lost(self) -> bool:
         """Whether there is a reference, but the test does not determine the parameter."""
-        nothing = self.state == "not determined" or self.remark == VAGUE
+        nothing = self.fitted.state == "not determined" or self.remark == VAGUE
         return nothing and self.reference is not None
 
     def difference_over(self, unit: float) -> float | None:
         """Return fitted minus reference over a unit; None if this is meaningless."""
         if self.remark or self.reference is None or not unit:
             return None
-        return (self.value - self.reference) / unit
+        return (self.fitted.value - self.reference.value) / unit
 
     @property
     def percent(self) -> float | None:
         """The difference in percent of the reference."""
-        return self.difference_over(abs(self.reference or 0.0) / 100.0)
+        return self.difference_over(abs(self.reference.value) / 100.0 if self.reference else 0.0)
 
     @property
     def standard_errors(self) -> float | None:
         """The difference in standard errors; both sides are assumed to be independent."""
-        return self.difference_over(math.hypot(self.stderr or 0.0, self.reference_stderr or 0.0))
+        errors = (one.stderr or 0.0 for one in (self.fitted, self.reference) if one)
+        return self.difference_over(math.hypot(*errors))
 
 
 @dataclass(frozen=True)
@@ -135,17 +134,11 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
 
 def recognised(test: str) -> str | None:
     """Return the published set that is named in the name of a test, if there is one."""
-
-    def plain(text: str) -> str:
-        return re.sub(r"[\s/_-]+", "-", text.casefold())
-
-    for name in sorted(published_sets, key=len, reverse=True):
-        if re.search(rf"(?<![a-z0-9]){plain(name)}(?![0-9a-z])", plain(test)):
-            return name
-    return None
-
-
-# ---------------------------------------------------------------- the sides
+    plain = partial(re.sub, r"[\s/_-]+", "-")
+    longest_first = sorted(published_sets, key=len, reverse=True)
+    patterns = {rf"(?<![a-z0-9]){plain(name)}(?![0-9a-z])": name for name in longest_first}
+    named = (name for word, name in patterns.items() if re.search(word, plain(test.casefold())))
+    return next(named, None)
 
 
 @dataclass(frozen=True)
@@ -193,17 +186,14 @@ class Side:
 
 def side_of(result: Result) -> Side:
     """Return the parameters of a fit; InputError if the result is incomplete."""
-    given: Mapping[str, Any]
-    if isinstance(result, Fit):
-        given = result.to_json_dict()
-    else:
-        given = result if isinstance(result, Mapping) else load_result(result)
+    known = result.to_json_dict() if isinstance(result, Fit) else result
+    given = known if isinstance(known, Mapping) else load_result(known)
     with reading(str(result) if isinstance(result, str | Path) else "the result"):
         model, about = Model.of_result(given), (given["test"], given["drive"], given["status"])
         every = given["parameters"].items()
         estimates = {n: build(ParameterEstimate, {**p, "state": p["state"]}, {}) for n, p in every}
-        known = given.get("correlation") or {"names": (), "matrix": ()}
-        numbers = _with_errors(estimates, known["names"], known["matrix"])
+        shared = given.get("correlation") or {"names": (), "matrix": ()}
+        numbers = _with_errors(estimates, shared["names"], shared["matrix"])
         label = f"{about[0]}: {law_in_words(model.name, model.relaxation)}, {about[1]} drive"
         return Side(label, model, estimates, numbers, _GIVEN | dict(given))
 
@@ -237,9 +227,6 @@ def published_side(name: str) -> Side:
     estimates = {n: ParameterEstimate(x, vary=False, state="published") for n, x in values.items()}
     given = {"model": "+".join(spring.law.kind for spring in item.chain.springs)}
     return Side(f"published {name}", Model.of_result(given), estimates, values, _GIVEN, item)
-
-
-# ---------------------------------------------------------------- one result, row by row
 
 
 def _pair(side: Side, other: Side) -> Pair:
@@ -278,12 +265,11 @@ def _row(
 ) -> Row:
     """Return a row; `about` are both sides and why nothing is compared, or ""."""
     side, other, nothing = about
-    size = max(abs(value.value), abs(reference.value) if reference else 0.0)
-    vague = reference is not None and (value.stderr or 0.0) > NOTHING * size
+    size = max(abs(one.value) for one in (value, reference) if one)
+    vague = VAGUE if reference and (value.stderr or 0.0) > NOTHING * size else ""
     known: dict[str, Any] = {"value": value, "reference": reference, "side": side, "other": other}
-    remark = nothing or words("remark", eta=eta, vague=VAGUE if vague else "", **known)
-    theirs, error = (reference.value, reference.stderr) if reference else (None, None)
-    return Row(label, unit, value.value, value.stderr, value.state, theirs, error, remark)
+    remark = nothing or words("remark", eta=eta, vague=vague, **known)
+    return Row(label, unit, value, reference, remark)
 
 
 def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
@@ -329,11 +315,9 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
     if ratio is not None:
         # ζ is η over a square root, so it has the state of η unless k_c is undetermined.
         unknown = ratio.state == "not determined" and value.state != "fixed"
-        state, remark = ratio.state if unknown else value.state, damping.remark
-        yield Row("ζ", "", ratio.value, ratio.stderr, state, item.damping_ratio, None, remark)
-
-
-# ---------------------------------------------------------------- text and figure
+        ratio = replace(ratio, state=ratio.state if unknown else value.state)
+        stated = None if item.damping_ratio is None else ParameterEstimate(item.damping_ratio)
+        yield Row("ζ", "", ratio, stated, damping.remark)
 
 
 def comparison_text(comparison: Comparison) -> str:
@@ -341,15 +325,15 @@ def comparison_text(comparison: Comparison) -> str:
     return words("comparison", comparison=comparison, with_error=_with_error)
 
 
-def _with_error(value: float | None, stderr: float | None) -> str:
+def _with_error(p: ParameterEstimate | None) -> str:
     """Return a number and its error, rounded to two digits of the error; "–" for None."""
-    if value is None:
+    if p is None:
         return "–"
-    if stderr is None:
-        return f"{value:.4g}".replace("-", "−")
-    if max(abs(value), stderr) >= 1e5:
-        return f"{significant(value, 3)} ± {significant(stderr)}".replace("-", "−")
-    return readable("", ParameterEstimate(value, stderr)).with_error
+    if p.stderr is None:
+        return f"{p.value:.4g}".replace("-", "−")
+    if max(abs(p.value), p.stderr) >= 1e5:
+        return f"{significant(p.value, 3)} ± {significant(p.stderr)}".replace("-", "−")
+    return readable("", p, (1.0, "")).with_error
 
 
 def plot_comparison(
@@ -370,19 +354,17 @@ def plot_comparison(
     panels = dict[str, Panel]()
     for test, pair in zip(tests, comparison.pairs, strict=True):
         for row in pair.rows:
-            if row.standard_errors is not None or row.lost:
+            if row.reference and (row.standard_errors is not None or row.lost):
                 one = panels.setdefault(row.label, Panel(row.label, _math(row.label), {}, {}))
-                one.tests[test] = _estimate(row.value, row.stderr, row.unit, row.state)
-                theirs = row.reference or 0.0, row.reference_stderr
-                one.references[test] = _estimate(*theirs, row.unit, comparison.reference)
+                one.tests[test] = _drawn(row.fitted, row.unit, row.fitted.state)
+                one.references[test] = _drawn(row.reference, row.unit, comparison.reference)
     title = f"fitted and {comparison.reference} parameters"
-    figure = plot_parameters(title, tests, list(panels.values()), width=width)
-    return figures.save(figure, path)
+    return figures.save(plot_parameters(title, tests, list(panels.values()), width=width), path)
 
 
-def _estimate(value: float, stderr: float | None, unit: str, state: str) -> ParameterEstimate:
-    ends = None if stderr is None else (value - 1.96 * stderr, value + 1.96 * stderr)
-    return ParameterEstimate(value, stderr, ends, unit, state=state)
+def _drawn(p: ParameterEstimate, unit: str, state: str) -> ParameterEstimate:
+    ends = None if p.stderr is None else (p.value - 1.96 * p.stderr, p.value + 1.96 * p.stderr)
+    return replace(p, ci95=ends, unit=unit, state=state)
 
 
 def _math(label: str) -> str:

@@ -47,8 +47,7 @@ def describe(test: Measurement, audit: EnergyAudit) -> str:
         ],
         exact=taken_for_exact(test),
     )
-    cells = (line.partition("¦") for line in lines)
-    return labelled((label, [text]) for label, _, text in cells)
+    return labelled((label, [text]) for label, _, text in (line.partition("¦") for line in lines))
 
 
 def taken_for_exact(test: Measurement) -> dict[str, str]:

@@ -59,10 +59,8 @@ def inches(width: str) -> float:
     from foamfit.data.units import parse_quantity
 
     length, _, option = (part.strip().lower() for part in width.partition(","))
-    wide = COLUMNS.get(length)
-    if wide is None:
-        metres = parse_quantity(length, "m", "the width of figures", "85 mm")
-        wide = round(metres / 0.0254, 6)
+    if (wide := COLUMNS.get(length)) is None:
+        wide = round(parse_quantity(length, "m", "the width of figures", "85 mm") / 0.0254, 6)
     if not NARROWEST <= wide <= WIDEST or option not in ("", UNTITLED):
         low, high = (f"{25.4 * end:.0f}" for end in (NARROWEST, WIDEST))
         raise InputError(
@@ -168,8 +166,7 @@ def images(figure: Figure, *forms: Format, dpi: int = DPI) -> list[bytes]:
 
     with matplotlib.rc_context(STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # in names of tests
-        engine = figure.get_layout_engine()
-        if engine is not None:
+        if (engine := figure.get_layout_engine()) is not None:
             engine.execute(figure)
             figure.set_layout_engine(None)
         try:

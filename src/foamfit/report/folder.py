@@ -1,4 +1,4 @@
-"""Writing, replacing and reading of result folders."""
+"""Results as Python and notebooks show them, and the folders that keep them."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import os
 import re
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from zipfile import BadZipFile
 
 import numpy as np
@@ -19,11 +20,13 @@ from foamfit.arrays import Array
 from foamfit.codec import plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, reason, replacing
-from foamfit.report.figures import TWO, write_both
-from foamfit.report.result_figures import figures_of
+from foamfit.report.figures import TWO, inches, write_both
+from foamfit.report.plots import figures_of
+from foamfit.report.readable import Readable
 from foamfit.report.summary import render_report
 from foamfit.report.tables import numbers_of, parameters_tex, with_head
 from foamfit.results import SCHEMA, Fit
+from foamfit.text import wrapped
 
 SAMPLES = "samples.npz"
 # Files of each kind of result, by the file that identifies it. They include files that only older
@@ -45,6 +48,58 @@ FILES = {
 _OF_FITS = "fit.json", "cycles.json", "batch.json"  # of fits of one record, one by one
 
 
+class Result:
+    """A result that Python shows in a few lines and a folder keeps."""
+
+    _kind: ClassVar[str]  # the file that identifies it, one of `FILES`
+
+    def write(self, folder: Path, *, pages: bool, width: str) -> None:
+        """Write all files into an existing folder; pages and figures only with `pages`."""
+        raise NotImplementedError
+
+    @property
+    def failed(self) -> bool:
+        """Whether no acceptable fit was found."""
+        return getattr(self, "status", "") == "failed"
+
+    def text(self, *, verbose: bool = False) -> str:
+        """Return the text that the command prints; only that of a fit may be `verbose`."""
+        raise NotImplementedError
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """Return the content of the JSON file of the result: SI, plain types, None if missing."""
+        raise NotImplementedError
+
+    def printed(self) -> dict[str, Any]:
+        """Return what the command prints as JSON."""
+        return self.to_json_dict()
+
+    def save(
+        self,
+        folder: str | Path,
+        *,
+        report: bool = True,
+        figure_width: str = TWO,
+        force: bool = False,
+    ) -> Path:
+        """Write the result folder and return its path; an older folder is replaced at the end.
+
+        A result of another kind, such as a joint fit, is replaced only with `force`. Without
+        `report`, neither pages nor figures are written. `figure_width` is "one" or "two" columns,
+        or a length ("85 mm"); ", untitled" after it omits the titles.
+        """
+        inches(figure_width)  # rejects an invalid width
+        check_target(folder, of=None if force else self._kind)
+        return save_whole(folder, partial(self.write, pages=report, width=figure_width))
+
+
+def brief(title: str, line: str, rows: Sequence[Readable]) -> str:
+    """Return a result in a few lines: a line about it, and its parameters."""
+    marks = {"weak": " (weak)", "not determined": " (not determined)"}
+    values = (f"{p.label} {p.with_unit(p.with_error)}{marks.get(p.state, '')}" for p in rows)
+    return "\n".join([*wrapped(f"{title}: {line}", 2), *wrapped(", ".join(values), 2)])
+
+
 def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool = False) -> Path:
     """Let `write` fill a new folder, which replaces an older result when complete; return it.
 
@@ -64,10 +119,8 @@ def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool
     return folder
 
 
-def save_somewhere(
-    save: Callable[..., object], folder: Path, *, report: bool = True, **options: Any
-) -> None:
-    """Call `save` with a folder, `report` and further options.
+def save_somewhere(save: Callable[..., object], folder: Path, *, report: bool) -> None:
+    """Call `save` with a folder and `report`.
 
     If `folder` cannot be written, save the result next to it, in the current directory or among
     temporary files. If the report fails, which is a defect, save the numbers without it.
@@ -78,18 +131,18 @@ def save_somewhere(
         If `folder` cannot be written; the message names the folder used instead.
     """
     try:
-        save(folder, report=report, **options)
+        save(folder, report=report)
         return
     except InputError as error:
         message = str(error)
     except Exception:
         with suppress(Exception):
-            save(folder, report=False, **options)
+            save(folder, report=False)
         raise
     for place in (folder.parent, Path(), Path(tempfile.gettempdir())):
         other = place / f"{folder.resolve().name}-{time.strftime('%Y%m%d-%H%M%S')}"
         with suppress(InputError):
-            save(other, report=report, **options)
+            save(other, report=report)
             message = f"{message.removesuffix('; choose another folder')}; it is in {other} instead"
             break
     raise InputError(message)
@@ -163,10 +216,9 @@ def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
             "not replaced; choose a new or an empty folder"
         )
     own = _OF_FITS if of in _OF_FITS else (of,)
-    other = [] if of is None else [name for name in kinds if name not in own]
-    if other:
+    if of is not None and (other := [name for name in kinds if name not in own]):
         raise InputError(
-            f"{folder} holds {other[0]}, which does not belong to a {Path(str(of)).stem}, so it is "
+            f"{folder} holds {other[0]}, which does not belong to a {Path(of).stem}, so it is "
             "not replaced; choose a new or an empty folder"
         )
     tests = _content(place / "joint.json").get("tests")  # folders of a joint fit
@@ -183,8 +235,7 @@ def is_written(path: Path, tests: Collection[str] = ()) -> bool:
     if path.is_symlink():
         return False
     if path.is_dir() and (re.fullmatch(r"cycle-\d+", path.name) or path.name in tests):
-        within = list(path.iterdir())
-        return all(inner.name in FILES["fit.json"] and is_written(inner) for inner in within)
+        return all(one.name in FILES["fit.json"] and is_written(one) for one in path.iterdir())
     return any(path.name in names for names in FILES.values()) and path.is_file()
 
 
@@ -194,8 +245,7 @@ def _content(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):  # neither UTF-8 nor JSON
         return {}
-    valid = isinstance(content, dict) and {"schema", "foamfit"} <= content.keys()
-    return content if valid else {}
+    return content if isinstance(content, dict) and {"schema", "foamfit"} <= content.keys() else {}
 
 
 def load_result(folder: str | Path) -> dict[str, Any]:

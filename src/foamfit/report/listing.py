@@ -18,22 +18,12 @@ from foamfit.codec import build, decode, plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.parts import ParameterEstimate, law_in_words
-from foamfit.report import figures
+from foamfit.report import figures, tables
 from foamfit.report.figures import tail
 from foamfit.report.folder import load_result
 from foamfit.report.render import page, words
 from foamfit.report.studies.parameters import panels_of, plot_parameters
 from foamfit.report.summary import CURVES
-from foamfit.report.tables import (
-    MISFITS,
-    by_test,
-    by_test_tex,
-    count_determined,
-    unit_of_all,
-    varied,
-    wide,
-    with_head,
-)
 from foamfit.results import Fit
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
@@ -86,7 +76,7 @@ class Row:
     @property
     def counts(self) -> tuple[int, int]:
         """How many parameters of the springs are determined, and how many are varied."""
-        return count_determined(self.parameters)
+        return tables.count_determined(self.parameters)
 
     @property
     def date(self) -> str:
@@ -118,17 +108,13 @@ def results_in(folder: str | Path) -> list[Row]:
 
     Raises InputError if the folder contains no result.
     """
-    top = Path(folder)
-    if not top.is_dir():
+    if not (top := Path(folder)).is_dir():
         raise InputError(f"{folder} is not a folder; foamfit fit TEST.csv writes results to fits/")
-    found = sorted({path for name in ("fit.json", "joint.json") for path in top.rglob(name)})
-    of_joint = {path.parent for path in found if path.name == "joint.json"}
-    kept = [
-        path for path in found if path.name == "joint.json" or path.parent.parent not in of_joint
-    ]
-    if not kept:
+    joints = {*top.rglob("joint.json")}
+    fits = {one for one in top.rglob("fit.json") if one.parent.parent / "joint.json" not in joints}
+    if not joints | fits:
         raise InputError(f"there is no result in {folder}; foamfit fit TEST.csv writes one")
-    return [_listed(path) for path in kept]
+    return [_listed(path) for path in sorted(joints | fits)]
 
 
 def _listed(path: Path) -> Row:
@@ -178,17 +164,14 @@ def _largest(tests: dict[str, Any]) -> dict[str, float]:
 
 def small_loop(path: Path) -> tuple[str, ...]:
     """Return the measured and the fitted loop of a curves.csv as points of SVG polylines."""
-    if not path.is_file():
-        return ()
     try:
         with path.open(encoding="utf-8") as file:
             head = file.readline().strip().split(",")
-            if not {STRAIN, STRESS} <= set(head):
-                return ()
-            columns = [head.index(name) for name in (STRAIN, STRESS, FITTED) if name in head]
+            columns = [head.index(STRAIN), head.index(STRESS)]
+            columns += [head.index(FITTED)] if FITTED in head else []
             values = np.loadtxt(file, delimiter=",", usecols=columns, ndmin=2)
-    except (OSError, ValueError):  # damaged
-        values = np.empty((0, 3))
+    except (OSError, ValueError):  # missing or damaged, or there is no loop
+        return ()
     if not len(values):
         return ()
     values = values[np.unique(np.linspace(0, len(values) - 1, POINTS).astype(int))]
@@ -213,14 +196,14 @@ def table_of(results: Sequence[Row], top: Path) -> dict[str, Any]:
         replace(one, place=one.place if one.place.name else top / one.test) for one in results
     ]
     alike = len({one.model for one in results if not one.error}) <= 1
-    parameters = varied([one.parameters for one in results if alike])
-    found = by_test([one.place.relative_to(top).as_posix() for one in results], parameters)
+    parameters = tables.varied([one.parameters for one in results if alike])
+    found = tables.by_test([one.place.relative_to(top).as_posix() for one in results], parameters)
     loops = [small_loop(one.place / "curves.csv") for one in results]
     misfits = {name for one in results for name, x in one.misfit.items() if x is not None}
     return {
         "rows": list(zip(results, loops, ((at, p) for at, *p in found["rows"]), strict=True)),
         "heads": found["heads"],
-        "misfits": {curve: name for curve, name in MISFITS.items() if curve in misfits},
+        "misfits": {curve: name for curve, name in tables.MISFITS.items() if curve in misfits},
         "more": list(dict.fromkeys(name for one in results for name in one.more)),
         "models": not alike,
         "options": any(one.options for one in results),
@@ -280,16 +263,13 @@ def row_of(test: str, file: str, result: Fit) -> Row:
     return Row(test, file, result.status, error, misfit, runtime, result.parameters)
 
 
-# ------------------------------------------------------------------------------- the table
-
-
 def table_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return the rows of summary.csv in SI, one per test; None for missing values."""
     return [
         {name: getattr(row, name) for name in ("test", "file", "status", "error")}
         | {f"misfit_{name}": row.misfit.get(name) for name in CURVES}
         | {"runtime_s": row.runtime_s, **parameters}
-        for row, parameters in zip(rows, wide([row.parameters for row in rows]), strict=True)
+        for row, parameters in zip(rows, tables.wide([row.parameters for row in rows]), strict=True)
     ]
 
 
@@ -310,7 +290,7 @@ def read_table(path: Path) -> pd.DataFrame:
 
 def write_summary(rows: Sequence[Row], folder: Path) -> None:
     """Write summary.csv."""
-    write_file(folder / "summary.csv", csv_bytes(with_head(table_rows(rows))))
+    write_file(folder / "summary.csv", csv_bytes(tables.with_head(table_rows(rows))))
 
 
 def counts_in_words(rows: Sequence[Row]) -> str:
@@ -329,9 +309,9 @@ def summary_words(rows: Sequence[Row]) -> str:
     Its table contains median and quartiles over the tests for each varied parameter.
     """
     wrong, parameters = [row for row in rows if not row.has_fit], list[Any]()
-    for name, each in varied([row.parameters for row in rows if row.has_fit]).items():
+    for name, each in tables.varied([row.parameters for row in rows if row.has_fit]).items():
         present = [p for p in each if p is not None]
-        factor, unit = unit_of_all(present)
+        factor, unit = tables.unit_of_all(present)
         quartiles = np.quantile([p.value / factor for p in present], [0.5, 0.25, 0.75])
         parameters.append((name, quartiles, unit, [p.state for p in present]))
     return words(
@@ -343,9 +323,6 @@ def summary_words(rows: Sequence[Row]) -> str:
     )
 
 
-# ------------------------------------------------------------------------------- the page
-
-
 def write_comparison(
     rows: Sequence[Row], folder: Path, title: str, *, width: str, pictures: bool
 ) -> bytes | None:
@@ -355,9 +332,11 @@ def write_comparison(
     """
     fitted = [row for row in rows if row.has_fit]
     tests = [row.test for row in fitted]
-    every = varied([row.parameters for row in fitted])
+    every = tables.varied([row.parameters for row in fitted])
     found = {name: each for name, each in every.items() if name not in NUISANCE}
-    write_file(folder / "summary.tex", by_test_tex("Test", tests, found).encode("utf-8", "replace"))
+    write_file(
+        folder / "summary.tex", tables.by_test_tex("Test", tests, found).encode("utf-8", "replace")
+    )
     if not (pictures and found):
         return None
     figure = plot_parameters(
@@ -371,10 +350,9 @@ def write_comparison(
 
 def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | None = None) -> None:
     """Write summary.html, a self-contained page, with a figure (SVG)."""
-    shown = rows
-    if len(rows) > MOST_ON_PAGE:  # tests without a fit are always shown
-        first = {id(row) for row in rows[:MOST_ON_PAGE]}
-        shown = [row for row in rows if id(row) in first or not row.has_fit][: 2 * MOST_ON_PAGE]
+    # Tests without a fit are always shown.
+    some = [row for i, row in enumerate(rows) if i < MOST_ON_PAGE or not row.has_fit]
+    shown = some[: 2 * MOST_ON_PAGE]
     more: Any = {"picture": picture, "csv": "summary.csv", "left_out": len(shown) < len(rows)}
     text = index_page(shown, folder, title, counts_in_words(rows), **more)
     write_file(folder / "summary.html", text)

@@ -42,16 +42,14 @@ class Line:
 
 @dataclass(frozen=True)
 class Panel:
-    """Curves in common axes, with the names and SI units of the axes.
+    """Curves in common axes, with name and SI unit of x and of y.
 
     `below` are curves in a strip below the panel, in % of the measured range: residuals or others.
     """
 
     name: str  # "stress-strain", …
-    x_name: str
-    x_unit: str
-    y_name: str
-    y_unit: str
+    x: tuple[str, str]
+    y: tuple[str, str]
     lines: list[Line]
     below: list[Line] = field(default_factory=list)
     below_name: str = "residual"
@@ -68,9 +66,9 @@ class Panel:
 
     def scale(self) -> tuple[float, str, float, str]:
         """Return factor and axis label of x, then of y."""
-        x, x_unit = readable_unit(max(size(line.x) for line in self.lines), self.x_unit)
-        y, y_unit = readable_unit(max(size(line.y) for line in self.lines), self.y_unit)
-        return x, f"{self.x_name} ({x_unit})", y, f"{self.y_name} ({y_unit})"
+        fx, x_unit = readable_unit(max(size(line.x) for line in self.lines), self.x[1])
+        fy, y_unit = readable_unit(max(size(line.y) for line in self.lines), self.y[1])
+        return fx, f"{self.x[0]} ({x_unit})", fy, f"{self.y[0]} ({y_unit})"
 
 
 def is_known(result: Fit) -> bool:
@@ -93,38 +91,39 @@ def panels_of(result: Fit) -> list[Panel]:
         return None if result.misfit.get(curve) is None else fitted
 
     pushing = measured(c.time, c.measured_stress) + _fitted(c.time, c.stress)
-    moving = measured(c.time, c.measured_displacement, motion)
-    moving += _fitted(c.time, c.displacement)
-    fitted = compared("displacement_time", c.displacement)
-    off = _residual(c.time, c.measured_displacement, fitted)
-    for node, (seen, fitted) in c.interior.items():
-        moving += measured(c.time, seen, node=node) + _fitted(c.time, fitted, node)
+    moving, off = list[Line](), list[Line]()
+    for node, (seen, found) in {0: (c.measured_displacement, c.displacement), **c.interior}.items():
+        moving += measured(c.time, seen, motion, node) + _fitted(c.time, found, node)
+        fitted = found if node else compared("displacement_time", found)
         off += _residual(c.time, seen, fitted, node)
     loop = measured(strain, c.measured_stress, motion)
-    along = compared("stress_strain", c.stress_along)
     loop += _fitted(None if moved is None else moved / height, pushed)
     if strain is not None and c.stress_along is not None and not is_known(result):
         # Wide and pale below the others, because it coincides with them if the fit is good.
         pale = {"color": PALE, "lw": 3.2, "zorder": 2}
         loop.append(Line(strain, c.stress_along, "springs along measured strain", pale))
     pushed_off = _residual(c.time, c.measured_stress, compared("stress_time", c.stress))
-    looped_off = _residual(strain, c.measured_stress, along)
+    looped_off = _residual(strain, c.measured_stress, compared("stress_strain", c.stress_along))
+    time, stress = ("time", "s"), ("stress", "Pa")
     panels = [
-        Panel("stress-time", "time", "s", "stress", "Pa", pushing, pushed_off),
-        Panel("displacement-time", "time", "s", "displacement", "m", moving, off),
-        Panel("stress-strain", "strain", "–", "stress", "Pa", loop, looped_off),
+        Panel("stress-time", time, stress, pushing, pushed_off),
+        Panel("displacement-time", time, ("displacement", "m"), moving, off),
+        Panel("stress-strain", ("strain", "–"), stress, loop, looped_off),
     ]
     if is_known(result):
         panels = [panels[2], panels[0]]
     return [panel for panel in panels if panel.lines]
 
 
+def _line(x: Array | None, y: Array | None, *look: Any) -> list[Line]:
+    """Return a curve with label, style, kind and node, or none if it is missing."""
+    return [] if x is None or y is None else [Line(x, y, *look)]
+
+
 def measured(
     x: Array | None, y: Array | None, motion: str = "measured", node: int = 0
 ) -> list[Line]:
     """Return a measured curve, or none if it is missing."""
-    if x is None or y is None:
-        return []
     label, mark, edge = "measured", "o", "0.6"
     if node:
         mark, edge = MARKS[(node - 1) % len(MARKS)], _colour(node)
@@ -132,23 +131,18 @@ def measured(
     elif motion != "measured":
         label, mark = f"measured, motion {motion}", "s"
     style = {"marker": mark, "mfc": "white", "mec": edge, "mew": 0.6, "ms": 3.4, "zorder": 3}
-    return [Line(x, y, label, style, "measured", node)]
+    return _line(x, y, label, style, "measured", node)
 
 
 def _residual(x: Array | None, y: Array | None, fitted: Array | None, node: int = 0) -> list[Line]:
-    if x is None or y is None or fitted is None:
-        return []
-    style = {"color": _colour(node), "lw": 0.7}
-    off = 100.0 * (fitted - y) / (float(np.ptp(y)) or 1.0)
-    return [Line(x, off, "_fitted − measured", style)]
+    gap = None if y is None or fitted is None else 100.0 * (fitted - y) / (float(np.ptp(y)) or 1.0)
+    return _line(x, gap, "_fitted − measured", {"color": _colour(node), "lw": 0.7})
 
 
 def _fitted(x: Array | None, y: Array | None, node: int = 0) -> list[Line]:
-    if x is None or y is None:
-        return []
-    style = {"ls": DASHES[(node - 1) % len(DASHES)] if node else "-", "lw": 0.9, "zorder": 4}
-    label = f"mass {node}" if node else "fitted"
-    return [Line(x, y, label, style | {"color": _colour(node)}, "fitted", node)]
+    dashes = DASHES[(node - 1) % len(DASHES)] if node else "-"
+    style = {"ls": dashes, "lw": 0.9, "zorder": 4, "color": _colour(node)}
+    return _line(x, y, f"mass {node}" if node else "fitted", style, "fitted", node)
 
 
 def _colour(node: int) -> str:
@@ -255,9 +249,6 @@ def _shade_standstills(ax: Axes, panel: Panel, result: Fit) -> None:
             if line.kind == "measured":
                 at = (test.instants >= start) & (test.instants <= end)
                 ax.plot(line.x[at] / fx, line.y[at] / fy, lw=7.0, solid_capstyle="butt", **style)
-
-
-# ---------------------------------------------------------------------------- names in a panel
 
 
 class _Labels:

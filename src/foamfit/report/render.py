@@ -53,8 +53,8 @@ def words(name: str, **values: Any) -> str:
 
 
 def sentences(name: str, **values: Any) -> tuple[str, ...]:
-    """Render a text with one sentence per line and return its lines."""
-    return tuple(words(name, **values).splitlines())
+    """Render a text with one sentence per line and return its lines without the empty ones."""
+    return tuple(line for line in words(name, **values).splitlines() if line.strip())
 
 
 def table(name: str, **values: Any) -> list[list[str]]:

@@ -99,9 +99,8 @@ def _table(rows: list[Readable], *, short: bool, across: int) -> list[list[str]]
     """
     ranged = any(row.range for row in rows)
     bare = across == 3 or (across == 1 and short and ranged)
-    columns = {"parameter": "label"}
-    columns |= {"value": "value"} if bare else {"value ± stderr": "with_error"}
-    columns |= {"unit": "unit"}
+    value = {"value": "value"} if bare else {"value ± stderr": "with_error"}
+    columns = {"parameter": "label", **value, "unit": "unit"}
     if across == 1:
         columns |= {"95 % interval": "interval"} | ({"range": "range"} if ranged else {})
         columns |= {"state": "state"}

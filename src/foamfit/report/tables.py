@@ -77,15 +77,10 @@ def count_determined(parameters: Parameters) -> tuple[int, int]:
     return sum(p.state == "determined" for p in varied), len(varied)
 
 
-def names_of(each: Iterable[Parameters]) -> list[str]:
-    """Return the names of the parameters of all tests, those of the springs first."""
-    return springs_first(name for one in each for name in one)
-
-
 def varied(each: Sequence[Parameters]) -> dict[str, list[ParameterEstimate | None]]:
     """Return, for each parameter varied in any test, its values in all tests; None if missing."""
     out = dict[str, list[ParameterEstimate | None]]()
-    for name in names_of(each):
+    for name in springs_first(name for one in each for name in one):
         values = (one.get(name) for one in each)
         finite = [p if p is not None and np.isfinite(p.value) else None for p in values]
         if any(p is not None and p.vary for p in finite):
@@ -102,7 +97,7 @@ def with_head(rows: Iterable[Mapping[str, object]]) -> Iterator[Iterable[object]
 
 def wide(each: Sequence[Parameters]) -> Iterator[dict[str, Any]]:
     """Yield the parameters of each test as a row of a table, in SI; None for missing values."""
-    names = names_of(each)
+    names = springs_first(name for one in each for name in one)
     for parameters in each:
         row = dict[str, Any]()
         for name, p in zip(names, map(parameters.get, names), strict=True):
@@ -159,8 +154,7 @@ def frame(parameters: Mapping[str, Any], **more: Mapping[str, Any]) -> pd.DataFr
         row |= {key: values.get(name) for key, values in more.items()}
         known = {key: np.nan if one is None else one for key, one in row.items()}
         rows.append(known | {"unit": getattr(p, "unit", ""), "state": p.state})
-    made: pd.DataFrame = _frame_type()(rows, columns=None if rows else ["parameter"])
-    return made.set_index("parameter")
+    return _frame_type()(rows, columns=None if rows else ["parameter"]).set_index("parameter")
 
 
 def numbers_of(p: Any) -> dict[str, float | None]:
@@ -175,12 +169,11 @@ def stacked(frames: Mapping[Any, pd.DataFrame], name: str) -> pd.DataFrame:
     import pandas as pd
 
     filled = {key: one for key, one in frames.items() if len(one)}
-    made: pd.DataFrame = _frame_type()(pd.concat(filled, names=[name]))
-    return made
+    return _frame_type()(pd.concat(filled, names=[name]))
 
 
 @functools.cache
-def _frame_type() -> Any:
+def _frame_type() -> type[pd.DataFrame]:
     import pandas as pd
 
     class Table(pd.DataFrame):

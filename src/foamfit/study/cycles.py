@@ -20,11 +20,10 @@ from foamfit.one_model import Options, Progress, part_of
 from foamfit.options import Keywords
 from foamfit.parts import ParameterEstimate
 from foamfit.report import figures
-from foamfit.report.folder import write_json, write_result, write_table, write_text
+from foamfit.report.folder import Result, brief, write_json, write_result, write_table, write_text
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import own_name
 from foamfit.report.render import words
-from foamfit.report.shown import Result, brief
 from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
 from foamfit.report.summary import CURVES
 from foamfit.report.tables import by_test_tex, frame, stacked, varied, wide

@@ -20,8 +20,7 @@ from foamfit.fitting.links import KINDS, RATES
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.options import DRIVES
 from foamfit.parts import ParameterEstimate
-from foamfit.report.folder import load_result
-from foamfit.report.shown import Result
+from foamfit.report.folder import Result, load_result
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, split_name
 

@@ -28,7 +28,7 @@ from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 from foamfit.text import counted
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint, JointPoint
-from foamfit.trust.contested import judged, settle, unsettled
+from foamfit.trust.budget import judged, settle, unsettled
 from foamfit.trust.covariance import Ends
 from foamfit.trust.ranges import ITERATIONS, TRIALS, left_open, nearer, tolerance
 from foamfit.trust.residuals.law_error import CurveError, curve_errors

@@ -24,12 +24,11 @@ from foamfit.fitting.search import SearchRecord
 from foamfit.fitting.together import Together
 from foamfit.parts import OfLaw, ParameterEstimate
 from foamfit.report import figures
-from foamfit.report.folder import write_json, write_result, write_text
+from foamfit.report.folder import Result, brief, write_json, write_result, write_text
 from foamfit.report.listing import Row, table_of
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import readable, readable_unit
 from foamfit.report.render import page, sentences, words
-from foamfit.report.shown import Result, brief
 from foamfit.report.studies.parameters import Panel, plot_parameters
 from foamfit.report.tables import MISFITS, formula, frame, parameters_tex, stacked, symbols
 from foamfit.results import Fit, Loop, loop_of, stamp
@@ -39,9 +38,9 @@ from foamfit.study.joint_fit import LARGEST, JointFit, parameters_of
 from foamfit.study.study_file import Study
 from foamfit.text import counted, number
 from foamfit.trust.best_point import BestPoint
+from foamfit.trust.budget import unsettled
 from foamfit.trust.checklist import POOR, UNACCEPTABLE, status_of, warnings_of
 from foamfit.trust.conclude import conclude, noise_of
-from foamfit.trust.contested import unsettled
 from foamfit.trust.covariance import RULE, Ends
 
 if TYPE_CHECKING:

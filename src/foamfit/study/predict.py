@@ -24,7 +24,7 @@ from foamfit.fitting.scenes import channel_of
 from foamfit.fitting.search import Tracker, descend
 from foamfit.parts import ParameterEstimate
 from foamfit.report import render
-from foamfit.report.shown import Result
+from foamfit.report.folder import Result
 from foamfit.report.studies.prediction import COLOURS, PredictedCurve, Prediction
 from foamfit.springs.parameters import unit_of
 from foamfit.study.identified import NORMAL, Source, read_source
@@ -300,7 +300,7 @@ def _by_parameters(
     own = np.flatnonzero(np.diag(covariance) > 0.0)
     places = np.append(own, [aligning.index[name] for name in aligned]).astype(np.int64)
     slopes = objective.simulate(point, places=places).slopes
-    if not own.size or slopes is None:
+    if not own.size:
         return {}
     jacobian, out = objective.jacobian(point, places), dict[str, Array]()
     # With other parameters, the aligned nuisance parameters would change as well.

@@ -5,7 +5,7 @@ After the search, `settle` decides which nuisance parameters stay free, and weig
 noise from model error; `covariance` and `intervals` compute the uncertainty due to noise, `ranges`
 that due to model error; `checklist` tests the quality of a fit; `conclude` assembles the result and
 gives each parameter its state. All sentences are in `sentences.toml`. A newcomer may skip
-`profile`, `markov_chain` and `evidence`.
+`profile` and `evidence`.
 """
 
 from __future__ import annotations

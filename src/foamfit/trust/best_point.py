@@ -196,11 +196,6 @@ class BestPoint:
         """Student's t of the 95 % interval of each parameter, (k,)."""
         return np.array([covariance.half_width(1.0, freedom) for freedom in self.spread.freedom])
 
-    @property
-    def cuts(self) -> Array:
-        """Rise of the cost at the ends of each local 95 % interval, (k,)."""
-        return self.quantiles**2 * self.spread.inflation
-
     @cached_property
     def halves(self) -> Array:
         """Half of each local 95 % interval, (k,)."""
@@ -209,8 +204,8 @@ class BestPoint:
     @cached_property
     def known(self) -> list[str]:
         """Parameters that are determined or weak by their local interval."""
-        known = self.halves <= covariance.NOTHING * self.sizes
-        return [name for name, is_known in zip(self.names, known, strict=True) if is_known]
+        known = np.flatnonzero(self.halves <= covariance.NOTHING * self.sizes)
+        return [self.names[i] for i in known]
 
     def rises(self, residual: Array) -> Array:
         """Return the rise of the cost at another point as the χ² of each parameter, (k,)."""
@@ -275,25 +270,20 @@ class JointPoint:
 
     def _block(self, t: int) -> Block:
         """Return the block of a test."""
-        best, links, scales = self.bests[t], self.found.links, self._scales
+        best, links = self.bests[t], self.found.links
         block = best.block(self.errors[t] if self.errors else ())
-        through = np.zeros((len(best.names), scales.size))
-        room = np.array(block.room)
+        places = {name: i for i, name in enumerate(self.names)} | self._own[t]
+        through, room = np.zeros((len(best.names), self._scales.size)), np.array(block.room)
         for i, name in enumerate(best.names):
-            kind, at = links.kind(name), self._own[t].get(name)
-            if at is not None:
-                through[i, at] = 1.0
-            elif kind in RATES:
-                at, (v, b) = self.names.index(name), self.found.common[name]
+            at, kind = places[name], links.kind(name)
+            through[i, at] = 1.0
+            if kind in RATES:
+                v, b = self.found.common[name]
                 f, slope = factor(kind, b, links.x(t))
-                two = slice(at, at + 2)
-                through[i, two] = np.array([f, v * slope]) * scales[two] / best.sizes[i]
-            else:
-                at = self.names.index(name)
-                through[i, at] = scales[at] / best.sizes[i]
+                through[i, at : at + 2] = f, v * slope
             if kind not in ("own", "shared"):
                 room[i] = np.inf
-        return replace(block, through=through, room=room)
+        return replace(block, through=through * self._scales / best.sizes[:, None], room=room)
 
     def _drawn(self) -> tuple[Array, Array] | None:
         """Return the slopes and variances of the residuals that draw values to a common one."""

@@ -1,47 +1,57 @@
-"""Uncertainty budget: effect of the ± in the TOML on the parameters, and all other sources.
+"""Effect of wrong quantities of a test on the parameters: uncertainty budget and contradictions.
 
 Errors of height, area, masses and calibration are not noise, because they are the same for all
 samples of a test. The response of the best point to each is a Gauss-Newton step,
 Δθ = −(JᵀJ)⁺ Jᵀ Δr, with the residual computed for a test in which only that quantity differs.
 Stress is treated as force over area and strain as displacement over height, whichever the file
-contains.
+contains. If velocity, mass, force and motion do not agree, one of them is wrong, and it is unknown
+which; the best point is therefore moved for each way to settle the contradiction.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.measurement import Measurement
+from foamfit.data.calibration import Contradiction
+from foamfit.data.measurement import Measurement, is_clipped
+from foamfit.data.zeros import CONTRADICTED
 from foamfit.errors import SimulationError
 from foamfit.fitting import nuisance
 from foamfit.fitting.curves import later
 from foamfit.parts import ParameterEstimate
 from foamfit.results import SOURCES, Budget
-from foamfit.springs.parameters import NUISANCE
+from foamfit.springs.parameters import NUISANCE, unit_of
+from foamfit.text import listed
+from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import AT_LIMIT, SINGULAR
+from foamfit.trust.covariance import AT_LIMIT, SINGULAR, Ends
 
 # Largest relative change of a quantity for its derivative; curves have kinks where springs snap.
 STEP = 1e-4
 # Changes of parameters below this share of the largest one, all over their scales, are rounding.
 ROUNDING = 1e-6
+# A force whose zero is known no better than this share of its peak is doubtful.
+DOUBTFUL = 0.005
 # Nuisance parameters by the source of uncertainty to which they contribute.
 _CONTACT = (nuisance.CONTACT_TIME, *nuisance.ZEROS)
 _STRIKER = (*nuisance.POSITIVE, nuisance.TIME_SHIFT)
 # Owner of each quantity in a test, and its field, which is also its source of uncertainty.
 _QUANTITIES = {
-    "height": ("specimen", "height"),
-    "area": ("specimen", "area"),
+    "height": ("specimen", "height"), "area": ("specimen", "area"),
     "specimen_mass": ("specimen", "mass"),
-    "striker_mass": ("striker", "mass"),
-    "velocity": ("striker", "velocity"),
-}
+    "striker_mass": ("striker", "mass"), "velocity": ("striker", "velocity"),
+}  # fmt: skip
+# Zero of a channel that scales with a quantity, and the power.
+_OF_ZEROS = {
+    "area": ("stress_zero", -1.0), "stress_scale": ("stress_zero", 1.0),
+    "striker_mass": ("stress_zero", 1.0), "displacement_scale": ("displacement_zero", 1.0),
+}  # fmt: skip
 
 
 def responses(best: BestPoint) -> dict[str, Array]:
@@ -57,13 +67,6 @@ def responses(best: BestPoint) -> dict[str, Array]:
         for quantity, sigma in measurement.uncertainties.items()
         if quantity not in free
     }
-
-
-# Zero of a channel that scales with a quantity, and the power.
-_OF_ZEROS = {
-    "area": ("stress_zero", -1.0), "stress_scale": ("stress_zero", 1.0),
-    "striker_mass": ("stress_zero", 1.0), "displacement_scale": ("displacement_zero", 1.0),
-}  # fmt: skip
 
 
 def _value(test: Measurement, quantity: str) -> float:
@@ -94,20 +97,11 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
     steps = np.where(np.abs(steps) > rounding, steps, 0.0) * best.sizes
     moves = problem.moves(best.values, best.names)
     change = (0.5 * (high - low) + moves @ steps) * (share / step)
-    return np.asarray(change + _of_origin(best, quantity, share))
-
-
-def _of_origin(best: BestPoint, quantity: str, share: float) -> Array:
-    """Return the change of the zeros in the file, to which the fitted ones are added, (n_values,).
-
-    The zero of a channel scales with the channel.
-    """
-    problem, out = best.problem, np.zeros(best.values.size)
     zero, power = _OF_ZEROS.get(quantity, ("", 0.0))
     if zero in best.index and (quantity != "striker_mass" or problem.measurement.braked):
-        place = best.index[zero]
-        out[place] = power * share * problem.origins[place]
-    return out
+        # The zero in the file, to which the fitted one is added, scales with its channel.
+        change[best.index[zero]] += power * share * problem.origins[best.index[zero]]
+    return np.asarray(change)
 
 
 def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array]:
@@ -221,3 +215,112 @@ def _of_covariance(best: BestPoint) -> Iterator[tuple[str, dict[str, float]]]:
         parts = {"noise": noise[i], "contact and zero": striker[i] - noise[i]}
         parts["velocity"] = 1.0 - striker[i]
         yield name, {source: math.sqrt(part) for source, part in parts.items()}
+
+
+# ---------------------------------------------------------------- contradictions in a record
+
+Way = Mapping[str, float]  # factor of each quantity that is changed, and the time shift, s
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """Values of all parameters (n,), SI, after a way to settle a contradiction; None if it fails.
+
+    `words` is the way, like "velocity × 0.88 and force × 1.30".
+    """
+
+    words: str
+    values: Array | None
+
+
+def unsettled(best: BestPoint, found: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
+    """Return the contradictions that the fit does not settle by a parameter or its value.
+
+    Of a time shift, only what the fit leaves of it.
+    """
+    problem, usual = best.problem, best.problem.objective.usual
+    values = usual | dict(zip(problem.names, best.values.tolist(), strict=True))
+    free = set(problem.free()) - {prior.name for prior in problem.objective.priors}
+    speed, mass, scale = (values[name] / usual[name] for name in nuisance.POSITIVE)
+    settling = {"velocity": (speed,), "force_scale": (scale / mass,)}
+    # Between masses within the specimen the force is late without a fault of the clocks.
+    inert = problem.objective.interior_mass and len(problem.model.kinds) > 1
+    out = list[Contradiction]()
+    for one in found:
+        if one.quantity == nuisance.TIME_SHIFT:
+            one = replace(one, ratio=one.ratio - values[nuisance.TIME_SHIFT])
+            agrees = inert or abs(one.ratio) <= one.limit
+        else:
+            ratios = settling.get(one.quantity, (1.0 / speed, mass / scale))
+            agrees = all(abs(one.ratio / ratio - 1.0) <= one.limit for ratio in ratios)
+        if not (agrees or one.is_settled(free)):
+            out.append(one)
+    return tuple(out)
+
+
+def of_flight(best: BestPoint) -> tuple[Contradiction, ...]:
+    """Return what the flight shows of a velocity that differs by less than a contradiction."""
+    test = best.problem.measurement
+    if test.flight is None or nuisance.VELOCITY in best.problem.free():
+        return ()
+    ratio = test.flight[0] / best.problem.objective.usual[nuisance.VELOCITY]
+    says = [note for note in test.notes if CONTRADICTED in note]
+    return tuple(Contradiction(nuisance.VELOCITY, ratio, 0.0, one, ()) for one in says)
+
+
+def ways(found: Iterable[Contradiction], *, braked: bool) -> list[Way]:
+    """Return the ways to settle all contradictions; `braked` as in `Measurement`."""
+    ratios = {one.quantity: one.ratio for one in found}
+    out, motion = list[Way](), ratios.get("motion_scale")
+    if motion is not None:
+        late = {name: by for name, by in ratios.items() if name == nuisance.TIME_SHIFT}
+        out.append({"displacement_scale": motion} | late)
+        ratios = {"velocity": 1.0 / motion, "force_scale": 1.0 / motion} | late
+    speed = {name: ratios[name] for name in ("velocity", nuisance.TIME_SHIFT) if name in ratios}
+    if (force := ratios.get("force_scale")) is None:
+        return [*out, speed] if speed else out
+    out.append(speed | {"stress_scale": force})
+    return out if braked else [*out, speed | {"striker_mass": 1.0 / force}]
+
+
+def settle(best: BestPoint, found: Sequence[Contradiction]) -> tuple[Settled, ...]:
+    """Move the best point for each way to settle the contradictions in `found`."""
+    if not found or not best.names:
+        return ()
+    test, impact = best.problem.measurement, best.problem.objective.drive == "impact"
+    out = list[Settled]()
+    for way in ways(found, braked=test.braked):
+        # A given motion needs no striker.
+        way = {name: by for name, by in way.items() if impact or name not in nuisance.STRIKER}
+        words = [say("contradiction", "way", name=name, by=by) for name, by in way.items()]
+        moved = best.values.copy()
+        for name, by in way.items():
+            moved += response(best, name, by - (name != nuisance.TIME_SHIFT))
+        fails = not np.all(np.isfinite(moved))
+        out.append(Settled(listed(words) if words else "", None if fails else moved))
+    return tuple(out)
+
+
+def judged(
+    settled: Sequence[Settled], best: BestPoint, name: str, ends: Ends, state: tuple[str, str]
+) -> tuple[str, str]:
+    """Return state and reason of a parameter, which is not determined if it would move.
+
+    `ends` is its 95 % interval in the numbers of the file; `state` are its state and reason without
+    the contradiction.
+    """
+    if state[0] != "determined":
+        return state
+    at, zero = best.index[name], best.problem.measurement.origins.get(name, 0.0)
+    for one in settled:
+        there = None if one.values is None else float(one.values[at]) + zero
+        if there is None or not ends[0] <= there <= ends[1]:
+            return "weak", say("why", "contested", settled=one, there=there, unit=unit_of(name))
+    # The law errs, and the contradiction, or a doubtful force in an impact, may be the reason.
+    impact, test = best.problem.objective.drive == "impact", best.problem.measurement
+    if best.problem.kept if impact else settled and best.misfits:
+        clipped, zero = is_clipped(test), test.zeros.get("stress", 0.0)
+        peak = 0.0 if test.stress is None else float(test.stress.max())
+        if settled or clipped or zero > DOUBTFUL * peak:
+            return "weak", say("why", "contested_held", settled=settled, clipped=clipped)
+    return state

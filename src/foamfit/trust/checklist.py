@@ -62,10 +62,8 @@ def may_vanish(name: str) -> bool:
 
 def status_of(checklist: Iterable[Check]) -> str:
     """Return the status of a fit: "failed" after a fatal no, "warnings" after any other no."""
-    failed = [check for check in checklist if check.answer is False]
-    if any(check.fatal for check in failed):
-        return "failed"
-    return "warnings" if failed else "ok"
+    fatal = [check.fatal for check in checklist if check.answer is False]
+    return "failed" if any(fatal) else "warnings" if fatal else "ok"
 
 
 def warnings_of(checklist: Iterable[Check]) -> tuple[str, ...]:
@@ -161,9 +159,8 @@ def _at_noise(best: BestPoint, intervals: Intervals) -> Check:
             large = ratio > most + 3.0 * math.sqrt(tau / (2.0 * size))
             seen.append({"name": name, "ratio": ratio, "source": source, "large": large})
     long, large = longest > STRUCTURED, any(one["large"] for one in seen)
-    answer = False if missed or long or large else None
-    if answer is None and has_noise and (seen or longest >= 1.05):
-        answer = True
+    known = has_noise and bool(seen or longest >= 1.05)
+    answer = False if missed or long or large else known or None
     facts: dict[str, Any] = {"seen": seen, "missed": missed, "tau": longest, "long": long}
     return _check("noise", answer, ranged=intervals.ranged, **facts)
 
@@ -356,27 +353,24 @@ def _recovery(best: BestPoint) -> Iterator[Check]:
 
 def _time_shift(best: BestPoint, estimates: Estimates, found: Sequence[Contradiction]) -> Check:
     """Check what the equation of motion of the striker says of the clocks (`data.calibration`)."""
-    test, objective = best.problem.measurement, best.problem.objective
+    test, drive = best.problem.measurement, best.problem.objective.drive
+    fitted, striker = best.problem.objective.time_shift, test.striker
+    shift = estimates.get("time_shift") if fitted else None
+    held = fitted and not (shift and shift.vary)
     clocks = [one for one in found if one.quantity == "time_shift"]
-    contradicted = len(found) > len(clocks) and objective.drive == "impact"
-    facts: dict[str, Any] = {"held": False, "shift": None, "moving": True}
-    facts |= {"clipped": is_clipped(test), "contradicted": contradicted}
-    if objective.time_shift:
-        shift = estimates.get("time_shift")
-        facts |= {"held": shift is None or not shift.vary, "shift": shift and shift.value}
+    contradicted = len(found) > len(clocks) and drive == "impact"
+    clipped, moving = is_clipped(test), bool(striker and striker.mass and striker.velocity)
+    facts: dict[str, Any] = {"held": held, "clipped": clipped, "contradicted": contradicted}
+    facts |= {"shift": shift and shift.value, "moving": moving}
     if clocks:
-        stated = objective.time_shift
-        warning = say("contradiction", "said", one=clocks[0], drive=objective.drive, stated=stated)
+        warning = say("contradiction", "said", one=clocks[0], drive=drive, stated=fitted)
         return _check("time_shift", False, warnings=[warning], late=clocks[0].ratio, **facts)
-    if objective.time_shift:
-        return _check("time_shift", None if facts["held"] else True, **facts)
-    moving = test.striker is not None and test.striker.mass and test.striker.velocity
-    facts["moving"] = bool(moving)
-    with suppress(InputError):
-        check_time_shift(test, objective.drive)
-        fine = moving and not (facts["clipped"] or contradicted)
-        return _check("time_shift", True if fine else None, **facts)
-    return _check("time_shift", None, **facts)
+    fine = fitted and not held
+    if moving and not (fitted or clipped or contradicted):
+        with suppress(InputError):
+            check_time_shift(test, drive)
+            fine = True
+    return _check("time_shift", fine or None, **facts)
 
 
 def _one_step(

@@ -30,7 +30,7 @@ from foamfit.springs.parameters import any_param, split_name, unit_of
 from foamfit.text import engineering, listed
 from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
-from foamfit.trust.budget import changed, make_budget
+from foamfit.trust.budget import Settled, changed, judged, make_budget, of_flight, settle, unsettled
 from foamfit.trust.checklist import (
     POOR,
     lost_height,
@@ -39,7 +39,6 @@ from foamfit.trust.checklist import (
     status_of,
     warnings_of,
 )
-from foamfit.trust.contested import Settled, judged, of_flight, settle, unsettled
 from foamfit.trust.covariance import Ends
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
@@ -55,15 +54,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
     problem, objective, simulated = best.problem, best.problem.objective, best.simulated
     measurement, specimen = problem.measurement, problem.measurement.specimen
     intervals = Intervals() if intervals is None else intervals
-    insight = correlation = None
-    if best.names:
-        spread = best.spread
-        noise = {  # one standard deviation per curve, enlarged by the autocorrelation
-            name: math.sqrt(max(process.variance * process.tau, 1e-300)) / objective.factor(name)
-            for name, process in zip(objective.counted, spread.noise, strict=True)
-        }
-        insight = look(best, noise)
-        correlation = _correlation(best)
+    insight, correlation = (look(best), _correlation(best)) if best.names else (None, None)
     if record.stopped is not None and best.names and best.misfits:
         warnings = (*intervals.warnings, say("interval", "stopped"))
         intervals = replace(intervals, ranged=False, warnings=warnings)

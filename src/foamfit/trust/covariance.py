@@ -61,8 +61,7 @@ class Covariance:
     @property
     def correlation(self) -> Array:
         """Correlation matrix, (k, k)."""
-        scale = self.stderr
-        return self.matrix / np.outer(scale, scale)
+        return self.matrix / np.outer(self.stderr, self.stderr)
 
 
 def _directions(rows: Array) -> tuple[Array, Array, Array]:
@@ -154,10 +153,8 @@ class Block:
         assert self.gradient is not None
         every, rows = np.arange(self.jacobian.shape[1]), self.axes[1]
         unit_steps = rows.T / np.sum(rows**2, axis=1)
-        change = [
-            self.gradient(every, part * step) - self.gradient(every, -part * step)
-            for step in (unit_steps @ axes).T
-        ]
+        steps = part * (unit_steps @ axes).T
+        change = [self.gradient(every, step) - self.gradient(every, -step) for step in steps]
         return np.asarray(np.array(change) @ unit_steps / (2.0 * part))
 
 
@@ -251,11 +248,9 @@ class Uncertainty:
         """The same with the curvature of the cost of each test, and without unknowns in `held`."""
         free, reduced = ~self.held, self
         if not free.all():
-            reduced = Uncertainty(
-                tuple(block.without(self.held) for block in self.blocks),
-                self.scales[free],
-                None if self.drawn is None else (self.drawn[0][:, free], self.drawn[1]),
-            )
+            blocks = tuple(block.without(self.held) for block in self.blocks)
+            drawn = None if self.drawn is None else (self.drawn[0][:, free], self.drawn[1])
+            reduced = Uncertainty(blocks, self.scales[free], drawn)
         spreads = [left @ reduced.axes for left in reduced.lefts]
         pairs = zip(reduced.blocks, spreads, strict=False)
         return replace(reduced, curvatures=tuple(block.curvature(s @ s.T) for block, s in pairs))

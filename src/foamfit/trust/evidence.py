@@ -1,5 +1,8 @@
 """Evidence for a model: AICc and BIC if a model reaches the noise, else cross-validation.
 
+Tests of the randomness of residuals show whether a model reaches the noise; `find_structure` shows
+where it does not.
+
 AICc and BIC use the numbers of effective samples and parameters, so that neither correlated
 residuals nor combinations of parameters that the curves do not fix count as evidence. They assume
 that the residuals are noise. If every model has an error of its own, models are compared by how
@@ -18,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
@@ -29,7 +33,6 @@ from foamfit.results import Fit
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
 from foamfit.trust.residuals.noise_process import autocorrelation_time
-from foamfit.trust.residuals.residual_tests import neighbours_test, runs_test
 
 # p-value of the runs and neighbours tests below which residuals are not random. One true model in
 # ten to twenty fails by chance.
@@ -53,6 +56,45 @@ BLOCKS = 24
 # Largest number of Levenberg-Marquardt steps without a block, and the relative gain of the cost
 # below which two successive steps end the fit.
 STEPS, ENOUGH = 20, 1e-3
+# Structure is called bent if a parabola removes more than this share of its squares.
+BENT = 0.6
+
+
+def runs_test(residual: Array) -> float:
+    """Return the p-value of too few runs (Wald & Wolfowitz 1940, Ann. Math. Stat. 11, 147).
+
+    Given n₊ positive and n₋ negative residuals in random order, the number of runs of one sign has
+    mean μ = 2 n₊n₋/n + 1 and variance (μ-1)(μ-2)/(n-1), and is nearly normal (here with continuity
+    correction). The test is one-sided: slow waves make few runs; alternating noise is not
+    structure. Residuals are in the order of time; zeros are omitted.
+    """
+    signs = residual[residual != 0.0] > 0.0
+    n, positive = signs.size, int(np.count_nonzero(signs))
+    negative = n - positive
+    if n < 2:
+        return 1.0
+    if positive == 0 or negative == 0:
+        return math.ldexp(1.0, 1 - n)  # probability that n random signs are all the same
+    runs = 1 + int(np.count_nonzero(signs[1:] != signs[:-1]))
+    mean = 2.0 * positive * negative / n + 1.0
+    variance = (mean - 1.0) * (mean - 2.0) / (n - 1.0)
+    if variance <= 0.0:
+        return 1.0
+    return float(special.ndtr((runs + 0.5 - mean) / math.sqrt(variance)))
+
+
+def neighbours_test(residual: Array) -> float:
+    """Return the p-value of similar neighbouring residuals (von Neumann 1941, Ann. Math. Stat. 12).
+
+    For white noise Σ r_i r_{i+1} / Σ r_i² is nearly normal with variance 1/n. The test is
+    one-sided. It uses the size of the residuals and so detects a short strong wave that the runs
+    test misses; the runs test uses their signs and is not misled by a few large residuals.
+    """
+    power = float(residual @ residual)
+    if residual.size < 2 or power == 0.0:
+        return 1.0
+    rho = float(residual[1:] @ residual[:-1]) / power
+    return float(special.ndtr(-rho * math.sqrt(residual.size)))
 
 
 def misfit_of(objective: Objective, residual: Array) -> float:
@@ -125,11 +167,13 @@ class Tried:
         """Effective samples n/τ of all curves."""
         return float(sum(n / tau for n, tau in zip(self.sizes, self.taus, strict=True)))
 
-    @property
-    def places(self) -> list[NDArray[np.str_]]:
-        """Branches of the springs at each fitted sample of each curve."""
-        branches = branch_of_samples(self.best.problem, self.best.simulated)
-        return [branches[self.best.problem.objective.kept[name]] for name in self.counted]
+    def structure(self) -> dict[str, Any]:
+        """Return what is "left" in the least random "curve", and its "size" over the range."""
+        worst = int(np.argmin([min(runs_test(one), neighbours_test(one)) for one in self.curves]))
+        name, problem = self.counted[worst], self.best.problem
+        branches = branch_of_samples(problem, self.best.simulated)
+        left = find_structure(self.curves[worst], branches[problem.objective.kept[name]])
+        return {"left": left, "curve": name, "size": left.size / self.spans[worst]}
 
     def states(self, state: str) -> tuple[str, ...]:
         """Return the names of the parameters in a state."""
@@ -241,3 +285,34 @@ def choose(tried: Sequence[Tried]) -> Decision:
         predicted = [one.misfit for one in tried]
     scores = [Score(one.varied, one.misfit, p) for one, p in zip(tried, predicted, strict=True)]
     return decide(scores, by_noise, all(one.errs for one in tried))
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Place of the largest structure in the residual of a curve."""
+
+    # Root of the mean product of neighbouring residuals, in their units; 0 for white noise.
+    size: float
+    place: str  # branches of the springs, and loading or unloading
+    share: float  # of all structure
+    bent: float  # share of the squares there that a parabola over the samples removes
+
+    @property
+    def straight(self) -> bool:
+        """Whether a spring is there on a branch that is a straight line in the law."""
+        return "on d" in self.place or "on e" in self.place
+
+
+def find_structure(residual: Array, places: NDArray[np.str_]) -> Structure:
+    """Find the place, as of `fitting.branches.branch_of_samples`, with the largest structure."""
+    product, branches = residual[1:] * residual[:-1], places[1:]
+    sums = {str(place): float(product[branches == place].sum()) for place in np.unique(places)}
+    place = max(sums, key=lambda key: sums[key])
+    total = sum(max(value, 0.0) for value in sums.values())
+    own, bent = residual[places == place], 0.0
+    if own.size >= 8 and own.any():
+        base = np.vander(np.linspace(-1.0, 1.0, own.size), 3)
+        left = own - base @ np.linalg.lstsq(base, own, rcond=None)[0]
+        bent = 1.0 - float(left @ left) / float(own @ own)
+    size = math.sqrt(max(float(product.mean()), 0.0))
+    return Structure(size, place, sums[place] / total if total > 0.0 else 0.0, bent)

@@ -7,7 +7,7 @@ deviations of the noise per relative change of a parameter (over its scale,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -84,9 +84,7 @@ class Insight:
         return float(errors[-1]), named
 
     def sentence(self) -> str:
-        """Name the least determined direction; "" without parameters."""
-        if not self.names:
-            return ""
+        """Name the least determined direction."""
         error, parts = self.weakest()
         joint, scale = listed(f"{name} ({part:+.2g})" for name, part in parts.items()), ""
         if len(parts) == 1:
@@ -132,17 +130,18 @@ class Insight:
         )
 
 
-def look(best: BestPoint, noise: Mapping[str, float]) -> Insight:
+def look(best: BestPoint) -> Insight:
     """Compute the sensitivities at a point of the parameters, usually the best one.
 
-    `noise` is one standard deviation of each fitted curve, SI, times the root of the
+    The unit is one standard deviation of the noise of each curve, times the root of its
     autocorrelation time.
     """
     problem, objective, k = best.problem, best.problem.objective, len(best.names)
     labels = np.array(sections(problem, best.simulated))
     parts, triangles = list[tuple[str, str]](), list[Array]()
-    for curve, slopes in objective.by_curve(best.scaled).items():
-        rows = slopes / (objective.factor(curve) * noise[curve])
+    pairs = zip(objective.by_curve(best.scaled).items(), best.spread.noise, strict=True)
+    for (curve, slopes), noise in pairs:
+        rows = slopes / math.sqrt(max(noise.variance * noise.tau, 1e-300))
         for label in dict.fromkeys(labels.tolist()):
             triangle = np.linalg.qr(rows[labels[objective.kept[curve]] == label], mode="r")
             parts.append((curve, label))

@@ -42,7 +42,8 @@ class Refit:
 
     def __post_init__(self) -> None:
         """Set the space of the parameters and the gain at which a refit ends."""
-        self.space, cuts = self.best.problem.space(), self.best.cuts
+        self.space = self.best.problem.space()
+        cuts = self.best.quantiles**2 * self.best.spread.inflation  # rise at the ends of intervals
         self.enough = ENOUGH * float(min(cuts[np.isfinite(cuts)], default=1.0))
 
     def residual(self, point: Array) -> Array | None:

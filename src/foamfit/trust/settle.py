@@ -24,9 +24,9 @@ from foamfit.fitting.search import STOPPING, Freed, Tracker, descend, distinct, 
 from foamfit.springs.parameters import NUISANCE
 from foamfit.trust.best_point import BestPoint
 
-# The law errs if its RMS error exceeds this multiple of the noise, and this share of the scale of
-# the curve, which is at least half a percent of its range.
-OVER_NOISE, OVER_SCALE = 1.0, 0.2
+# The law errs if its RMS error exceeds the noise, and this share of the scale of the curve, which
+# is at least half a percent of its range.
+OVER_SCALE = 0.2
 MINIMA = 12  # ends of the search from which a descent begins once parameters are held
 ITERATIONS = 60  # of such a descent
 LEFT = 1e-6  # predicted gain of the sum of squares at which a refinement ends
@@ -56,10 +56,7 @@ def held_by_record(problem: Problem, asked: Collection[str]) -> Problem:
 
 def errs(best: BestPoint) -> bool:
     """Return whether the error of the law is larger than the noise in some curve."""
-    return any(
-        error.law > max(OVER_NOISE * math.sqrt(error.noise.variance), OVER_SCALE)
-        for error in best.errors
-    )
+    return any(one.law > max(math.sqrt(one.noise.variance), OVER_SCALE) for one in best.errors)
 
 
 def descend_again(problem: Problem, tracker: Tracker) -> None:

@@ -106,9 +106,9 @@ def plot_parameters(
         axes[0].set_yticks(range(0, count, step), names, parse_math=False)
         if not panels:
             figures.say_nothing_there(axes[0], "no parameter to compare")
-        entries, order = figures.named_in(axes), list(_MARKS)
-        known = sorted(entries, key=lambda label: order.index(label) if label in order else 9)
-        figures.legend_below(figure, {label: entries[label] for label in known})
+        entries = figures.named_in(axes)
+        marks = {label: entries[label] for label in _MARKS if label in entries}
+        figures.legend_below(figure, marks | entries)
     return figure
 
 
@@ -176,9 +176,8 @@ def _draw_others(ax: Axes, panel: Panel, tests: Sequence[str], factor: float) ->
         if p := panel.references.get(test):
             ax.vlines(p.value / factor, y - 0.36, y + 0.36, label=p.state, **line)
     if panel.has_law:
-        rows = [row for row, test in enumerate(tests) if test in panel.tests]
-        x = [panel.tests[tests[row]].value / factor for row in rows]
-        ax.plot(x, rows, label="common", **line)
+        rows = [y for y, test in enumerate(tests) if test in panel.tests]
+        ax.plot([panel.tests[tests[y]].value / factor for y in rows], rows, label="common", **line)
     elif panel.common is not None:
         value = panel.common.value / factor
         ax.axvline(value, label="common", **line)

@@ -16,10 +16,9 @@ from foamfit.data.rig import Candidate, Rig
 from foamfit.parts import OfLaw
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, TWO, VERMILION
-from foamfit.report.folder import write_json, write_text
+from foamfit.report.folder import Result, write_json, write_text
 from foamfit.report.readable import own_name
 from foamfit.report.render import page, sentences, words
-from foamfit.report.shown import Result
 from foamfit.results import stamp
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import unit_of
@@ -168,8 +167,7 @@ class Plan(Result, OfLaw):
 
         rows = []
         for one in self.outcomes:
-            asked = one.candidate
-            row: dict[str, Any] = {key: getattr(asked, key) for key in SETTINGS}
+            row: dict[str, Any] = {key: getattr(one.candidate, key) for key in SETTINGS}
             row |= {"breaks": one.breaks, "determined": one.number, "peak_force": one.force}
             row |= {"error": one.error} if self.quantity else {}
             row |= {f"told apart from {name}": x for name, x in one.apart.items()}

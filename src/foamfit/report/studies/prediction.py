@@ -16,11 +16,10 @@ from foamfit.data.measurement import Measurement
 from foamfit.parts import OfLaw, ParameterEstimate
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, INSIDE, TWO, VERMILION
-from foamfit.report.folder import write_columns, write_json
+from foamfit.report.folder import Result, write_columns, write_json
 from foamfit.report.panels import Line, Panel, measured
 from foamfit.report.plots import panelled
 from foamfit.report.render import words
-from foamfit.report.shown import Result
 from foamfit.results import flags_of, stamp
 from foamfit.springs.model import Model
 from foamfit.text import percent
@@ -62,18 +61,18 @@ class PredictedCurve:
         """Range of the measured values."""
         return float(np.ptp(self.measured))
 
-    def met(self, part: slice) -> tuple[float, float]:
+    def met(self, part: slice) -> dict[str, float]:
         """Return misfit over the range, and fraction inside the band, of a part of the samples."""
         kept, measured = self.kept[part], self.measured[part]
         residual = (self.predicted[part] - measured)[kept]
         within = (self.lo[part] <= measured) & (measured <= self.hi[part])
         misfit = np.sqrt(np.mean(residual**2)) / np.ptp(measured[kept])
-        return float(misfit), float(np.mean(within[kept]))
+        return {"misfit": float(misfit), "inside": float(np.mean(within[kept]))}
 
     @property
     def inside(self) -> float:
         """Fraction of the samples inside the band."""
-        return self.met(slice(None))[1]
+        return self.met(slice(None))["inside"]
 
     @property
     def half_width(self) -> float:
@@ -150,8 +149,7 @@ class Prediction(Result, OfLaw):
         The curve is the stress if the motion is prescribed, otherwise the first curve.
         """
         curve = self.curves.get("stress_time", next(iter(self.curves.values())))
-        each = {n: curve.met(part) for n, part in cycles_of(self.measurement).items()}
-        return {n: {"misfit": misfit, "inside": inside} for n, (misfit, inside) in each.items()}
+        return {n: curve.met(part) for n, part in cycles_of(self.measurement).items()}
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``prediction.json``: SI, plain types, None for missing values."""
@@ -228,7 +226,7 @@ def _panels(found: Prediction) -> list[Panel]:
         for way in (slice(None, turn + 1), slice(turn, None)):
             if stress is not None and moved is None:
                 loop.append(Line(strain[way], stress.lo[way], *BAND, high=stress.hi[way]))
-        panels.append(Panel("stress-strain", "strain", "–", "stress", "Pa", loop))
+        panels.append(Panel("stress-strain", ("strain", "–"), ("stress", "Pa"), loop))
     for c in found.curves.values():
         timed = ("time", "s") if m.time is not None else ("sample", "–")
         x = m.instants
@@ -238,15 +236,10 @@ def _panels(found: Prediction) -> list[Panel]:
         for part, look in COLOURS.items():
             if part in c.parts and np.any(c.parts[part]):
                 halves[part.replace("_", " ")] = (c.parts[part], *look)
-        below = [
-            Line(
-                x,
-                100.0 * half / c.range,
-                f"half width: {part}",
-                {"color": colour, "ls": dashes, "lw": 0.9},
-            )
-            for part, (half, colour, dashes) in halves.items()
-        ]
+        below = list[Line]()
+        for part, (half, colour, dashes) in halves.items():
+            style = {"color": colour, "ls": dashes, "lw": 0.9}
+            below.append(Line(x, 100.0 * half / c.range, f"half width: {part}", style))
         name = c.channel.replace("_", " ")
-        panels.append(Panel(f"{name}-time", *timed, name, c.unit, lines, below, "half width"))
+        panels.append(Panel(f"{name}-time", timed, (name, c.unit), lines, below, "half width"))
     return panels

@@ -1,4 +1,1 @@
-"""Analysis of the residuals of a fit: correlated noise and model error.
-
-`law_error` separates the two by their spectra; `residual_tests` tests for structure.
-"""
+"""The residuals of a fit: `law_error` separates correlated noise and model error by spectra."""

@@ -235,18 +235,14 @@ def _curve_error(residual: Array, basis: Array, own: NoiseProcess) -> CurveError
     local = np.convolve(residual, weights, "valid")
     least = math.sqrt(robust_variance(local)) / SMOOTHER
     most = ROUGHER * math.sqrt(float(np.mean(local**2)))
-    process = _within(_process(seen, with_law), kept, least, most)
+    process = _process(seen, with_law)
+    scatter = max(process.scatter(kept), 1e-300)
+    factor = min(max(scatter, least), most) / scatter  # so that it scatters like the record
+    process = replace(process, variance=factor**2 * process.variance)
     size = math.sqrt(max(float(residual @ residual) / n - process.variance, 0.0))
     if size < SMALLEST or (evidence <= 0.0 and own.scatter(kept) <= most):
         return CurveError(own, evidence)
     return CurveError(process, evidence, size)
-
-
-def _within(process: NoiseProcess, kept: Array, least: float, most: float) -> NoiseProcess:
-    """Return a process, scaled if its scatter about local cubics is not from `least` to `most`."""
-    scatter = max(process.scatter(kept), 1e-300)
-    factor = min(max(scatter, least), most) / scatter
-    return replace(process, variance=factor**2 * process.variance)
 
 
 def _process(seen: _Spectrum, found: _Sum) -> NoiseProcess:

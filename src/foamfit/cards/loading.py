@@ -96,9 +96,7 @@ def fitted_rates(source: Source) -> list[float]:
     return [float(rates[at]) for at in np.unique(np.round(np.log(rates) / _SAME), True)[1]]
 
 
-def loading_curves(
-    source: Source, rates: Sequence[float], measured_to: float
-) -> tuple[Curves, bool]:
+def curves_at(source: Source, rates: Sequence[float], measured_to: float) -> tuple[Curves, bool]:
     """Return the loading curves at ascending rates, and whether curves of the law cross.
 
     Each curve starts at zero, rises strictly and is nowhere below that of a lower rate. For a rate
@@ -217,8 +215,7 @@ def by_slowest(curves: Curves, motion: Motion) -> Replay:
     """
     back = (motion.rate < 0.0) & ~motion.first
     load = curves.at(curves.stress, motion.strain, np.where(back, 0.0, motion.rate))
-    summed: Array = cumulative_trapezoid(load, motion.strain, initial=0)
-    work = np.maximum(summed, 0.0)
+    work: Array = np.maximum(cumulative_trapezoid(load, motion.strain, initial=0), 0.0)
     energy = np.where(back, _ratio(work, np.maximum.accumulate(work)), 1.0)
     return lambda unloading: unloading.share(energy) * load
 
