@@ -22,8 +22,8 @@ from unittest.mock import patch
 import numpy as np
 
 import foamfit as ff
-from foamfit.study import batch_work
-from foamfit.study.batch_work import Recipe, Task, fingerprint, stored, work
+from foamfit.study import batch as study
+from foamfit.study.batch import Recipe, Task, fingerprint, stored, work
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
@@ -107,7 +107,7 @@ def measure_overhead(place: Path) -> dict[str, Any]:
     """Measure the overhead per test (read, compare, write) and the complete command."""
     make_tests(place / "tests", TINY, 601)
     recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=False)
-    fits, real = [0.0], batch_work.fit
+    fits, real = [0.0], study.fit
 
     def fit(*words: Any, **options: Any) -> Any:
         began = time.process_time()
@@ -117,7 +117,7 @@ def measure_overhead(place: Path) -> dict[str, Any]:
             fits[0] += time.process_time() - began
 
     paths, count = sorted((place / "tests").iterdir()), TINY - 20
-    with patch.object(batch_work, "fit", fit):
+    with patch.object(study, "fit", fit):
         for i, path in enumerate(paths):
             if i == 20:  # everything is loaded
                 fits[0], began = 0.0, time.process_time()
@@ -159,7 +159,7 @@ def measure_parts(place: Path) -> dict[str, Any]:
         began = time.process_time()
         for path in paths:
             fingerprint(recipe, path, toml)
-            stored(first.out, first.fingerprint, recipe)
+            stored(first)
         again = 1e3 * (time.process_time() - began) / len(paths)
         found[name] = {"files": len(files), "kB": sum(files) / 1e3, "again_ms": again}
     return found

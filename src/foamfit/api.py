@@ -79,9 +79,8 @@ class FitResult(Result, Fit):
         try:
             import xarray
         except ImportError:
-            raise InputError(
-                'samples need xarray, which is not installed; pip install "foamfit[mcmc]"'
-            ) from None
+            why = 'samples need xarray, which is not installed; pip install "foamfit[mcmc]"'
+            raise InputError(why) from None
         dims, about = ("chain", "draw"), {"test": self.measurement.name, "model": self.words}
         columns = {n: (dims, x, {"units": unit_of(n) or "1"}) for n, x in self.draws.items()}
         sizes = zip(dims, next(iter(self.draws.values())).shape, strict=True)
@@ -139,9 +138,8 @@ def fit(
         If none of the trial parameters could be simulated.
     """
     if not isinstance(measurement, Measurement):
-        raise InputError(
-            f"measurement is a {type(measurement).__name__}; give what foamfit.read_test returns"
-        )
+        why = f"measurement is a {type(measurement).__name__}; give what foamfit.read_test returns"
+        raise InputError(why)
     if params is not None and not isinstance(params, lmfit.Parameters):
         raise InputError("params must be lmfit.Parameters, as foamfit.make_params returns them")
     chosen = Options.of("fit", options)

@@ -18,7 +18,6 @@ from functools import partial
 from typing import Any
 
 import lmfit
-import numpy as np
 
 from foamfit import one_model
 from foamfit.arrays import Array
@@ -93,7 +92,6 @@ class _UnpromisingError(Exception):
 
 
 def _dampers(params: lmfit.Parameters) -> list[str]:
-    """Return the names of the damping parameters that vary."""
     return [name for name in params if split_name(name)[1] == "eta" and params[name].vary]
 
 
@@ -181,8 +179,8 @@ class _Comparison:
                     why = f"[specimen] heights are those of {len(heights)} springs"
                 elif model.relaxation and test.time is None:
                     why = "relaxation needs a time column"
-                allowed += [] if why else [model]
-                self._skip(model, why)
+                if not self._skip(model, why):
+                    allowed.append(model)
             groups += [allowed] if allowed else []
         if not groups:
             reasons = "; ".join(self.skipped)
@@ -225,7 +223,7 @@ class _Comparison:
                 self.stopped = "the time limit"
                 return
             try:
-                one = self._fit(model, damping, left, i / len(dampings), 1.0 / len(dampings))
+                one = self._fit(model, damping, left, i, len(dampings))
             except (_UnpromisingError, SimulationError) as error:
                 if damping == "without" and _is_damped(self.tried):
                     continue
@@ -241,14 +239,8 @@ class _Comparison:
         options = self.options
         return make_params(self.measurement, model, options.drive, time_shift=options.time_shift)
 
-    def _fit(
-        self, model: Model, damping: str, left: float | None, before: float, part: float
-    ) -> Tried:
-        """Fit one model with or without damping.
-
-        `before` and `part` are the fractions of the work for this model done before, and by, this
-        fit.
-        """
+    def _fit(self, model: Model, damping: str, left: float | None, i: int, count: int) -> Tried:
+        """Fit one model with or without damping; `i` of its `count` fits come before."""
         began, params = time.perf_counter(), self._params(model)
         inside = _below(model, self.tried)
         below = None if inside is None else self.fits[inside]
@@ -256,10 +248,8 @@ class _Comparison:
             for name in _dampers(params):
                 params[name].set(value=0.0, vary=False)
         named = rung_name(model.name, damping, model.relaxation)
-        start = CHOSEN * (self.number - 1 + before) / self.of
-        end = start + CHOSEN * 0.8 * part / self.of
-        told = f"model {self.number} of {self.of}: {named}: "
-        tell = part_of(self.progress, start, end, told)
+        start, end = (CHOSEN * (self.number - 1 + part / count) / self.of for part in (i, i + 0.8))
+        tell = part_of(self.progress, start, end, f"model {self.number} of {self.of}: {named}: ")
         options = replace(self.options, max_time=left, relaxation=model.relaxation)
         look = partial(self._look, damping) if len(model.kinds) > 1 else None
         found = one_model.identify(self.measurement, model.name, params, options, tell, look, below)
@@ -275,10 +265,9 @@ class _Comparison:
 
         Springs are compared with and without `damping` alike.
         """
-        like = [one for one in self.tried if damping in (one.damping, "none")]
-        alone = [one for one in like if len(Model.parse(one.result.model).kinds) == 1]
-        objective = problem.objective
-        found = misfit_of(objective, objective.residual(values))
+        like = (one for one in self.tried if damping in (one.damping, "none"))
+        alone = (one for one in like if "+" not in one.result.model)
+        found = misfit_of(problem.objective, problem.objective.residual(values))
         best = min(alone, key=lambda one: one.misfit, default=None)
         if best is not None and found > UNPROMISING * best.misfit:
             raise _UnpromisingError(
@@ -289,11 +278,11 @@ class _Comparison:
 
 def _is_damped(tried: Sequence[Tried]) -> bool:
     """Return whether a model with damping misses far less than every model without."""
-    least = {
-        damping: min((one.misfit for one in tried if one.damping == damping), default=math.nan)
-        for damping in ("without", "with")
-    }
-    return UNPROMISING * least["with"] < least["without"]
+    damped, undamped = (
+        min((one.misfit for one in tried if one.damping == damping), default=math.nan)
+        for damping in ("with", "without")
+    )
+    return UNPROMISING * damped < undamped
 
 
 def _hopeless(model: Model, tried: Sequence[Tried], unpromising: Sequence[Model] = ()) -> str:
@@ -331,10 +320,8 @@ def _has_gained(tried: Sequence[Tried], below: int) -> bool:
     decision = evidence.choose(tried)
     if decision.best >= below or decision.by_prediction:
         return decision.best >= below
-    return any(
-        min(values[below:]) < min(values[:below]) - MARGIN
-        for values in zip(*((one.aicc, one.bic) for one in decision.criteria), strict=True)
-    )
+    each = zip(*((one.aicc, one.bic) for one in decision.criteria), strict=True)
+    return any(min(values[below:]) < min(values[:below]) - MARGIN for values in each)
 
 
 # ---------------------------------------------------------------- the result
@@ -351,8 +338,8 @@ def _conclude(state: _Comparison) -> Fit:
     told |= {"blocks": BLOCKS, "share": SHARE, "bent": BENT, "margin": MARGIN}
     sound = [i for i, one in enumerate(tried) if not one.states("not determined")]
     if told["lost"] and sound:
-        costs = [tried[i].misfit if decision.by_prediction else criteria[i].bic for i in sound]
-        nearest = sound[int(np.argmin(costs))]
+        by_misfit = decision.by_prediction
+        nearest = min(sound, key=lambda i: tried[i].misfit if by_misfit else criteria[i].bic)
         higher = criteria[nearest].bic - criteria[decision.best].bic
         told |= {"sound": tried[nearest], "higher": higher}
     if result.at_noise is False and not any(one.structureless for one in tried):
@@ -383,7 +370,7 @@ def _conclude(state: _Comparison) -> Fit:
 
 def _rung(i: int, tried: Sequence[Tried], decision: evidence.Decision) -> Rung:
     """Return the row of model `i` in the comparison, with the reason for its rank."""
-    one, result, found, place = tried[i], tried[i].result, decision.criteria[i], decision.before[i]
+    one, result, place = tried[i], tried[i].result, decision.before[i]
     before, gain = None if place is None else tried[place], None
     if before and one.predicted is not None and before.predicted is not None:
         gain = 1.0 - one.predicted / before.predicted
@@ -391,8 +378,8 @@ def _rung(i: int, tried: Sequence[Tried], decision: evidence.Decision) -> Rung:
     told |= {"gain": gain, "worse": evidence.WORSE, "share": SHARE, "margin": MARGIN}
     return Rung(
         **{name: getattr(result, name) for name in ("model", "relaxation", "stopped")},
+        **{name: getattr(decision.criteria[i], name) for name in ("rank", "aicc", "bic")},
         **{name: getattr(one, name) for name in ("damping", "chisqr", "runs_p", "neighbours_p")},
-        **{name: getattr(found, name) for name in ("rank", "aicc", "bic")},
         **{name: getattr(one, name) for name in ("seconds", "n_eff")},
         misfit=dict(result.misfit),
         n_vary=one.varied,

@@ -30,14 +30,11 @@ def reading(what: str) -> Iterator[None]:
     """Turn errors of reading a result in the body into an InputError of one sentence."""
     try:
         yield
-        return
-    except InputError as error:
-        fault = str(error)
-    except KeyError as error:
-        fault = f"{error} is missing"
-    except (TypeError, ValueError, AttributeError):
+    except (KeyError, TypeError, ValueError, AttributeError) as error:  # InputError among them
         fault = "a value is of the wrong kind"
-    raise InputError(f"{what} cannot be read back: {fault}; fit again")
+        if isinstance(error, InputError | KeyError):
+            fault = str(error) if isinstance(error, InputError) else f"{error} is missing"
+        raise InputError(f"{what} cannot be read back: {fault}; fit again") from None
 
 
 def plain(value: Any, columns: Columns | None = None) -> Any:
@@ -47,10 +44,7 @@ def plain(value: Any, columns: Columns | None = None) -> Any:
     finite becomes its name, or None without `columns`.
     """
     if hasattr(value, "valuesdict"):  # lmfit's parameters, whose own writer pickles functions
-        every = {
-            name: {key: getattr(one, key) for key in _PARAMETER} for name, one in value.items()
-        }
-        return plain(every, columns)
+        value = {n: {key: getattr(one, key) for key in _PARAMETER} for n, one in value.items()}
     if isinstance(value, Mapping):
         return {str(key): plain(item, columns) for key, item in value.items()}
     if isinstance(value, Spring):
@@ -58,18 +52,17 @@ def plain(value: Any, columns: Columns | None = None) -> Any:
         return {"kind": value.law.kind, "values": list(value.values), "relaxation": relaxation}
     if is_dataclass(value):
         kept = ((one.name, getattr(value, one.name), one.metadata) for one in fields(value))
-        return {
-            name: plain(item, columns)
-            for name, item, about in kept
-            if item is not None or "omitted" not in about
-        }
+        shown = {n: x for n, x, about in kept if x is not None or "omitted" not in about}
+        return plain(shown, columns)
     if isinstance(value, np.ndarray):
         pairs = (columns or {}).items()
         same = (name for name, one in pairs if np.array_equal(one, value, equal_nan=True))
         name = next(same, None)
         return plain(value.tolist(), columns) if name is None else {"column": name}
-    if isinstance(value, np.generic | PurePath):
-        return plain(value.item() if isinstance(value, np.generic) else str(value), columns)
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, list | tuple):
         return [plain(item, columns) for item in value]
     if isinstance(value, float) and not math.isfinite(value):

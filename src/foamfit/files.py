@@ -126,11 +126,9 @@ def replacing(target: Path, *, folder: bool = True, swept: bool = False) -> Iter
 
 def _remove(path: Path) -> None:
     """Remove a file or a folder, ignoring errors."""
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        with suppress(OSError):
-            path.unlink()
+    shutil.rmtree(path, ignore_errors=True)
+    with suppress(OSError):  # of a file
+        path.unlink()
 
 
 def reason(error: BaseException) -> str:

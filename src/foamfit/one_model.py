@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -17,44 +17,23 @@ from foamfit.arrays import Array
 from foamfit.codec import plain
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
+from foamfit.fitting import search
 from foamfit.fitting.curves import check_time_shift, choose_drive
 from foamfit.fitting.minima import exchange_springs, in_order, scan_places, settle_ends
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params, make_problem
-from foamfit.fitting.search import (
-    NEWS,
-    REFINED,
-    STOPPING,
-    SearchRecord,
-    SearchStoppedError,
-    Tracker,
-    distinct,
-    ensure_feasible,
-    has_several,
-    leave_minimum,
-    rank,
-    search,
-    what_stopped,
-)
+from foamfit.fitting.search import STOPPING, SearchRecord, SearchStoppedError, Tracker, what_stopped
 from foamfit.fitting.starts import carried
 from foamfit.options import DRAWS, FREED, STARTS, STARTS_IN_SERIES, Given, Watch
 from foamfit.results import Fit, Intervals
 from foamfit.solve.cache import SPENT
 from foamfit.springs.model import Model, with_options
 from foamfit.text import listed
+from foamfit.trust import settle
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
 from foamfit.trust.intervals import Announce, Choice, assess, evaluations_of
 from foamfit.trust.ranges import Open, left_open
-from foamfit.trust.settle import (
-    back_to_plain,
-    descend_again,
-    held_by_record,
-    keep_to_record,
-    refine,
-    weigh_motion,
-    weigh_priors,
-)
 
 CARRIED = 8  # minima of a poorer model from which the search of a richer one begins
 Progress = Callable[[float, str], None]
@@ -87,8 +66,7 @@ class Options(Given):
     @property
     def choice(self) -> Choice:
         """The method of the intervals."""
-        draws = DRAWS if self.draws is None else self.draws
-        return Choice(self.intervals, draws, self.seed)
+        return Choice(self.intervals, self.draws or DRAWS, self.seed)
 
     @property
     def of_springs(self) -> dict[str, bool]:
@@ -103,8 +81,7 @@ class Options(Given):
         Defaults are left out, among them the default drive of the test and its first cycle.
         `several` are the cycles of a record that are fitted one by one.
         """
-        every = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "watch"}
-        defaults = {one.name: one.default for one in fields(self)}
+        every = {name: value for name, value in vars(self).items() if name != "watch"}
         if model != "auto":
             parsed = Model.parse(model)
             model = parsed.words
@@ -113,7 +90,7 @@ class Options(Given):
         every["vary"] = sorted(set(self.vary))
         every["draws"] = self.choice.draws if self.intervals == "mcmc" else None
         with suppress(InputError):  # a test without a drive is refused by the fit
-            if self.drive is not None and self.drive == choose_drive(measurement, self.vary):
+            if self.drive and self.drive == choose_drive(measurement, self.vary):
                 every["drive"] = None
         first, last = measurement.cycle, measurement.last_cycle
         if several:
@@ -123,7 +100,8 @@ class Options(Given):
             every["cycles"] = f"{first}-{last}"
         elif first != min(measurement.cycles, default=first):
             every["cycle"] = first
-        changed = {n: value for n, value in every.items() if value and value != defaults.get(n)}
+        usual = vars(Options())
+        changed = {n: value for n, value in every.items() if value and value != usual.get(n)}
         return dict(plain({"model": model, **changed}))
 
     def drive_for(self, measurement: Measurement) -> str:
@@ -141,8 +119,8 @@ class Options(Given):
 
     def check_auto(self, **given: object) -> None:
         """Reject options of a single model, and those in `given`, if models are to be compared."""
-        own = ("priors", self.priors), ("fix and vary", self.fix or self.vary)
-        for name, value in (*given.items(), *own):
+        own = {"priors": self.priors, "fix and vary": self.fix or self.vary}
+        for name, value in (*given.items(), *own.items()):
             if value:
                 raise InputError(f"{name} belong to one model; name it instead of 'auto'")
         if self.relaxation:
@@ -167,22 +145,13 @@ class Options(Given):
         """Return the problem of fitting one model."""
         chosen = self.params(measurement, model)
         if params is not None and chosen is not None:
-            raise InputError(
-                "fix and vary have no effect beside params; set the value and vary of params"
-            )
-        params = chosen if params is None else params
+            why = "fix and vary have no effect beside params; set the value and vary of params"
+            raise InputError(why)
         model = with_options(model, **self.of_springs)
-        return make_problem(
-            measurement,
-            model,
-            self.drive,
-            params,
-            self.weights,
-            self.interior_mass,
-            time_shift=self.time_shift,
-            relaxation=self.relaxation,
-            priors=measurement.priors | dict(self.priors or {}),
-        )
+        given = (self.drive, chosen or params, self.weights, self.interior_mass)
+        more: Any = {"time_shift": self.time_shift, "relaxation": self.relaxation}
+        more["priors"] = {**measurement.priors, **(self.priors or {})}
+        return make_problem(measurement, model, *given, **more)
 
 
 def part_of(progress: Progress, begin: float, end: float, prefix: str = "") -> Progress:
@@ -201,8 +170,8 @@ class Found:
     def minima(self) -> list[Array]:
         """Return the best of the distinct minima that the search has met, the best one first."""
         tracker, space = Tracker(self.problem.objective), self.problem.space()
-        ends = [*self.tracker.ends, *[x for x in [self.tracker.best_values] if x is not None]]
-        ranked = distinct(rank(tracker, space, [space.encode(values) for values in ends]))
+        ends = [x for x in (*self.tracker.ends, self.tracker.best_values) if x is not None]
+        ranked = search.distinct(search.rank(tracker, space, [space.encode(x) for x in ends]))
         return [space.decode(point) for _, point in ranked[:CARRIED]]
 
     def best(self) -> BestPoint:
@@ -213,21 +182,18 @@ class Found:
         problem, space, cost = self.problem, self.problem.space(), self.tracker.best_cost
         assert self.tracker.best_values is not None  # checked by identify
         values = in_order(space, problem.objective, self.tracker.best_values) + 0.0  # no -0
-        names = problem.free()
+        names, moved = problem.free(), values.copy()
         places = [problem.index[name] for name in names]
-        near, moved = AT_LIMIT * problem.sizes(names, values), values.copy()
+        near = AT_LIMIT * problem.sizes(names, values)
         for limits in (space.low, space.high):
             close = np.abs(values[places] - limits[places]) <= near
             moved[places] = np.where(close, limits[places], moved[places])
-        moved = space.complete(moved)
-        best = BestPoint(problem, values)
-        if np.array_equal(moved, values):
+        best, at_limits = BestPoint(problem, values), BestPoint(problem, space.complete(moved))
+        if np.array_equal(at_limits.values, values):
             return best
-        at_limits = BestPoint(problem, moved)
-        try:
+        with suppress(SimulationError):
             return at_limits if at_limits.cost <= cost + 1e-6 * (1.0 + cost) else best
-        except SimulationError:
-            return best
+        return best
 
 
 def identify(
@@ -245,7 +211,7 @@ def identify(
     """
     began = time.perf_counter()
     problem = options.problem(measurement, model, params)
-    each = STARTS_IN_SERIES if has_several(problem.model) else STARTS
+    each = STARTS_IN_SERIES if search.has_several(problem.model) else STARTS
     starts = each * len(problem.model.kinds) if options.starts is None else options.starts
     deadline = None if options.max_time is None else time.monotonic() + options.max_time
     better = None if options.watch is None else partial(options.watch, problem)
@@ -254,11 +220,12 @@ def identify(
     led = below is not None
     record = SearchRecord(options.seed, starts, began, compiled=SPENT.seconds, led=led)
     known = [] if below is None else carried(problem.space(), below.problem.space(), below.minima())
-    problem, record = _search(problem, tracker, record, options.vary, progress, known)
+    found = _search(Found(problem, tracker, record), options.vary, progress, known)
     if tracker.best_values is None:
-        tried, why = problem.objective.evaluations, "check the drive, the heights and the bounds"
+        objective, why = found.problem.objective, "check the drive, the heights and the bounds"
+        tried = objective.evaluations
         try:
-            problem.objective.simulate(problem.vector())
+            objective.simulate(found.problem.vector())
         except SimulationError as error:
             why = str(error)
         if options.fix:
@@ -267,7 +234,7 @@ def identify(
             f"{measurement.name}: none of the {tried} sets of parameters that were tried could be "
             f"simulated; {why}"
         )
-    return Found(problem, tracker, record)
+    return found
 
 
 def judge(
@@ -324,8 +291,8 @@ def _assess(
             if made.better is None:
                 return best, record, replace(made, ranges=left.ranges)
             tracker.consider(made.better)
-            refine(problem, tracker)
-            back_to_plain(problem, tracker)
+            settle.refine(problem, tracker)
+            settle.back_to_plain(problem, tracker)
         except SearchStoppedError:
             return found.best(), record, Intervals()
         best = found.best()
@@ -337,20 +304,14 @@ def _assess(
 
 
 def _search(
-    problem: Problem,
-    tracker: Tracker,
-    record: SearchRecord,
-    asked: Collection[str],
-    progress: Progress,
-    known: Sequence[Array],
-) -> tuple[Problem, SearchRecord]:
-    """Search and refine; return the problem, and the record with costs and reason of a stop.
+    begun: Found, asked: Collection[str], progress: Progress, known: Sequence[Array]
+) -> Found:
+    """Search and refine; the record has the costs and the reason of a stop.
 
-    The search begins from points already `known`, if there are any.
-
-    Along a given motion, contact and zeros are fitted after the search only: the first rise shows
-    them to a fraction of a sample.
+    The search begins from points already `known`, if there are any. Along a given motion, contact
+    and zeros are fitted after it only: the first rise shows them to a fraction of a sample.
     """
+    problem, tracker, record = begun.problem, begun.tracker, begun.record
     rng, early = np.random.default_rng(record.seed), list[Array]()
     thinned, impact = problem.thinned(), problem.objective.drive == "impact"
     coarse = Tracker(thinned.objective, tracker.deadline, tracker.better, looked=tracker.looked)
@@ -358,13 +319,14 @@ def _search(
     def search_thinned(problem: Problem) -> list[tuple[float, int]]:
         """Search on the thinned record; its ends become those of the tracker."""
         space = problem.space()
-        costs = search(coarse, space, starts=record.starts, rng=rng, progress=progress, known=known)
+        how: Any = {"rng": rng, "progress": progress, "known": known}
+        costs = search.search(coarse, space, starts=record.starts, **how)
         reached = coarse.best_cost
         if not known:  # else springs were exchanged before
             exchange_springs(coarse, space)
         scan_places(coarse, space)
-        if coarse.best_cost < (1.0 - NEWS) * reached:
-            leave_minimum(coarse, space, new=not known)
+        if coarse.best_cost < (1.0 - search.NEWS) * reached:
+            search.leave_minimum(coarse, space, new=not known)
         best = [] if coarse.best_values is None else [coarse.best_values]
         tracker.ends += [*best, *coarse.ends]
         return costs
@@ -375,23 +337,23 @@ def _search(
             tracker.ends += early
         else:
             coarse.best_values, coarse.best_cost, coarse.ends = None, np.inf, []
-            search_thinned(held_by_record(thinned, asked))
+            search_thinned(settle.held_by_record(thinned, asked))
 
     try:
-        costs = search_thinned(thinned if impact else held_by_record(thinned, asked))
+        costs = search_thinned(thinned if impact else settle.held_by_record(thinned, asked))
         record = replace(record, costs=tuple(costs))
         early += [] if impact else tracker.ends
-        progress(REFINED, "refinement")
-        descend_again(problem, tracker)
-        problem, freed = keep_to_record(problem, tracker, asked, search_held)
+        progress(search.REFINED, "refinement")
+        settle.descend_again(problem, tracker)
+        problem, freed = settle.keep_to_record(problem, tracker, asked, search_held)
         record = replace(record, freed=freed)
-        problem = weigh_priors(problem, tracker)
-        weigh_motion(problem, tracker)
+        problem = settle.weigh_priors(problem, tracker)
+        settle.weigh_motion(problem, tracker)
         settle_ends(tracker, problem.space())
     except STOPPING as error:
         if tracker.best_values is None and coarse.best_values is not None:
             tracker.consider(coarse.best_values)
-        ensure_feasible(tracker, problem.space(), np.random.default_rng(record.seed))
-        return problem, replace(record, stopped=what_stopped(error))
+        search.ensure_feasible(tracker, problem.space(), np.random.default_rng(record.seed))
+        return Found(problem, tracker, replace(record, stopped=what_stopped(error)))
     progress(1.0, "done")
-    return problem, record
+    return Found(problem, tracker, record)

@@ -69,9 +69,6 @@ class ParameterEstimate:
         return replace(self, **missing)
 
 
-# ---------------------------------------------------------------- the comparison of models
-
-
 def rung_name(model: str, damping: str, relaxation: int = 0) -> str:
     """Describe model, relaxation and damping in words."""
     words, more = _in_words(model)

@@ -321,7 +321,7 @@ class Fit(OfLaw):
         least once by the end of the cycle. Empty for a single cycle and for the other drives.
         """
         c, strain, out = self.curves, self.strain, dict[int, dict[str, Any]]()
-        fitted, measured = c.stress, c.measured_stress
+        fitted, measured, snapping = c.stress, c.measured_stress, self.snapping
         if self.drive != "displacement" or strain is None or fitted is None or measured is None:
             return out
         for number, part in cycles_of(self.measurement).items():
@@ -330,9 +330,7 @@ class Fit(OfLaw):
                 "misfit": rms / float(np.ptp(measured[part])),
                 "dissipated_measured": float(np.trapezoid(measured[part], strain[part])),
                 "dissipated_fitted": float(np.trapezoid(fitted[part], strain[part])),
-                "ever_snapped": {
-                    name: float(one.ever[part][-1]) for name, one in self.snapping.items()
-                },
+                "ever_snapped": {n: float(one.ever[part][-1]) for n, one in snapping.items()},
             }
         return out
 
@@ -345,7 +343,7 @@ class Fit(OfLaw):
     def strain(self) -> Array | None:
         """Overall strain along the fitted curves; None if neither simulated nor measured."""
         c = self.curves
-        moved = c.displacement if c.displacement is not None else c.measured_displacement
+        moved = c.measured_displacement if c.displacement is None else c.displacement
         return None if moved is None else moved / self.measurement.specimen.height
 
     def nuisance(self, name: str, exact: float = 0.0) -> float:
@@ -420,13 +418,10 @@ class Fit(OfLaw):
                 "notes": test.notes,
             },
             "specimen": test.specimen,
-            **{name: getattr(self, name) for name in head},
-            "warnings": self.warnings,
-            "notes": self.notes,
+            **{name: getattr(self, name) for name in (*head, "warnings", "notes")},
             **model.options,
             "model": model.words,
-            "checklist": self.checklist,
-            "parameters": self.parameters,
+            **{name: getattr(self, name) for name in ("checklist", "parameters")},
             "derived": self._derived(),
             **{name: getattr(self, name) for name in found},
             "outliers": {
@@ -465,13 +460,13 @@ class Fit(OfLaw):
 
     def _derived(self) -> dict[str, dict[str, Any]]:
         """Return the derived points of the springs, and their largest snapped fraction."""
-        derived = dict[str, dict[str, Any]]()
+        derived, snapping, strain = dict[str, dict[str, Any]](), self.snapping, self.strain
         for name, spring in self.springs.items():
             points = {one.attribute: getattr(spring, one.attribute) for one in spring.law.points}
-            if (snapped := self.snapping.get(name)) is not None:
-                points["p_max"] = snapped.most
-                points["p_max_stress"] = snapped.stress[snapped.turn]
-                points["p_max_strain"] = None if self.strain is None else self.strain[snapped.turn]
+            if (snapped := snapping.get(name)) is not None:
+                turn = snapped.turn
+                points |= {"p_max": snapped.most, "p_max_stress": snapped.stress[turn]}
+                points["p_max_strain"] = None if strain is None else strain[turn]
                 points["snap_strain"] = getattr(spring, "snap_strain", None)
             if points:
                 derived[name] = points

@@ -11,18 +11,8 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.data import toml_file as toml
 from foamfit.data.csv_file import read_history
-from foamfit.data.toml_file import (
-    Check,
-    Quantity,
-    Rule,
-    Several,
-    Table,
-    anything,
-    check_keys,
-    checked,
-    load_toml,
-)
 from foamfit.errors import InputError, naming
 from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.solve.simulation import Response
@@ -38,62 +28,69 @@ RESPONSE = "time (s),base stress (Pa),strain"
 
 
 # Check of a quantity whose sign the chain or the drive checks.
-_any = partial(Quantity, positive=False)
+_any = partial(toml.Quantity, positive=False)
 
 
-def _of(param: Param) -> Quantity:
-    """Check of a parameter of a spring."""
+def _of(param: Param) -> toml.Quantity:
     return _any(param.unit.replace(" ", "*"), param.example or f"1 {param.unit}".strip())
 
 
-def _one_of(words: Iterable[str]) -> Rule:
-    """Check of a word."""
-    known = list(words)
-    right = " or ".join([", ".join(known[:-1]), known[-1]])
-    return Rule(lambda v: v in known, right)
+def _one_of(words: Iterable[str]) -> toml.Rule:
+    *known, last = words
+    return toml.Rule(lambda v: v in (*known, last), f"{', '.join(known)} or {last}")
 
 
 _MASS = _any("kg", "7 g")
 _TERM = {key: _of(COMMON[key]) for key in ("g", "tau")}
 _EXAMPLE = '{ g = 0.5, tau = "0.2 s" }'
-_RELAXATION = Several(Table(_TERM, _EXAMPLE, tuple(_TERM)), f"of terms like [{_EXAMPLE}]", "term")
-_CHAIN: dict[str, Check] = {
+_RELAXATION = toml.Several(
+    toml.Table(_TERM, _EXAMPLE, tuple(_TERM)), f"of terms like [{_EXAMPLE}]", "term"
+)
+_CHAIN: dict[str, toml.Check] = {
     "area": _any("m**2", "19.6 mm^2"),
     "diameter": _any("m", "5 mm"),
-    "springs": anything,
+    "springs": toml.anything,
     "site_damping": _any("Pa*s", "0 Pa*s"),
 }
-_IMPACT: dict[str, Check] = {
-    "kind": anything,
+_SPRING: dict[str, toml.Check] = {
+    "kind": toml.anything,
+    "height": _of(COMMON["height"]),
+    "mass": _MASS,
+}
+_IMPACT: dict[str, toml.Check] = {
+    "kind": toml.anything,
     "mass": _MASS,
     "velocity": _any("m/s", "1.75 m/s"),
     "gravity": _any("m/s**2", "9.81 m/s^2"),
 }
-_TIME: dict[str, Check] = {
-    "end": Quantity("s", "1 ms"),
-    "samples": Rule(
+_TIME: dict[str, toml.Check] = {
+    "end": toml.Quantity("s", "1 ms"),
+    "samples": toml.Rule(
         lambda v: type(v) is int and 2 <= v <= _MOST_SAMPLES,
         f"a whole number from 2 to {_MOST_SAMPLES}",
     ),
 }
-_FILE: dict[str, Check] = {
-    "kind": anything,
-    "file": Rule(lambda v: isinstance(v, str), 'a CSV like "drive.csv"'),
+_FILE: dict[str, toml.Check] = {
+    "kind": toml.anything,
+    "file": toml.Rule(lambda v: isinstance(v, str), 'a CSV like "drive.csv"'),
 }
 
 
 def read_scene(path: Path) -> tuple[Chain, Drive, Array]:
     """Read chain, drive and sample times (s); `foamfit simulate --help` lists the keys."""
-    document = load_toml(path, "give the TOML file of a scene")
-    check_keys(f"{path}:", document, ["chain", "drive", "time"])
+    document = toml.load_toml(path, "give the TOML file of a scene")
+    toml.check_keys(f"{path}:", document, ["chain", "drive", "time"])
     with naming(path):
         chain, table = _chain(_table(document, "chain")), _table(document, "drive")
         kind = _one_of(("impact", "stress", "displacement"))(table.get("kind"), "[drive] kind")
         if kind == "impact":
-            samples = checked(_table(document, "time"), _TIME, "[time]", ["end"])
+            samples = toml.checked(_table(document, "time"), _TIME, "[time]", ["end"])
             time = np.linspace(0.0, samples["end"], samples.get("samples", 501))
-            return chain, _impact(table), time
-        file = checked(table, _FILE, "[drive]", ["file"])["file"]
+            striker = toml.checked(table, _IMPACT, "[drive]", ["mass", "velocity"])
+            del striker["kind"]
+            with naming("[drive]"):
+                return chain, Impact(**striker), time
+        file = toml.checked(table, _FILE, "[drive]", ["file"])["file"]
         if "time" in document:
             raise InputError("[time] must be left out, the samples are those of the drive.")
     time, values = read_history(path.parent / file, kind)
@@ -108,9 +105,9 @@ def _table(document: dict[str, Any], name: str) -> dict[str, Any]:
 
 def _chain(table: dict[str, Any]) -> Chain:
     if "published" in table:
-        check_keys("[chain]", table, ["published"])
+        toml.check_keys("[chain]", table, ["published"])
         return published[_one_of(published)(table["published"], "[chain] published")].chain
-    found = checked(table, _CHAIN, "[chain]", [] if "diameter" in table else ["area"])
+    found = toml.checked(table, _CHAIN, "[chain]", [] if "diameter" in table else ["area"])
     if {"diameter", "area"} <= found.keys():
         raise InputError("[chain] has both a diameter and an area; give one of them.")
     area = found["area"] if "area" in found else math.pi / 4.0 * found["diameter"] ** 2
@@ -129,21 +126,14 @@ def _spring(table: dict[str, Any], number: int) -> tuple[Spring, float, float]:
     extra = max(law.options, key=len, default=())  # all parameters that options can free
     wide = laws.law(laws.with_options(law.kind, extra))
     law = wide if set(wide.own) - set(law.own) & set(table) else law
-    keys: dict[str, Check] = {"kind": anything, "height": _of(COMMON["height"]), "mass": _MASS}
-    keys |= {name: _of(param) for name, param in law.by_name.items()}
+    keys = _SPRING | {name: _of(param) for name, param in law.by_name.items()}
     keys |= {"relaxation": _RELAXATION} if law.hysteretic else {}
     needed = [name for name, param in law.by_name.items() if param.neutral is None]
-    found = checked(table, keys, f"{where}:", [*needed, "height"])
+    found = toml.checked(table, keys, f"{where}:", [*needed, "height"])
     values: list[Any] = [found.get(name, param.neutral) for name, param in law.by_name.items()]
     terms = [(term["g"], term["tau"]) for term in found.get("relaxation", ())]
     with naming(where):
         return law.make(values, terms), found["height"], found.get("mass", 0.0)
-
-
-def _impact(table: dict[str, Any]) -> Impact:
-    found = checked(table, _IMPACT, "[drive]", ["mass", "velocity"])
-    with naming("[drive]"):
-        return Impact(found["mass"], found["velocity"], found.get("gravity", 0.0))
 
 
 def check_target(path: Path) -> None:

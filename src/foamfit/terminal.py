@@ -75,7 +75,6 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def _handles_signals() -> bool:
-    """Return whether this thread may install signal handlers."""
     return threading.current_thread() is threading.main_thread()
 
 
@@ -103,13 +102,10 @@ def ending_cleanly() -> Iterator[None]:
 
 def _raise_again(lost: Any) -> None:
     """Send a signal again if Python has ignored its exception; a hook of `sys`."""
-    if isinstance(lost.exc_value, TerminatedError):
-        number = lost.exc_value.number
-    elif isinstance(lost.exc_value, KeyboardInterrupt):
-        number = signal.SIGINT
-    else:
+    if not isinstance(lost.exc_value, KeyboardInterrupt):
         sys.__unraisablehook__(lost)
         return
+    number = getattr(lost.exc_value, "number", signal.SIGINT)
     again = threading.Timer(0.02, signal.raise_signal, (number,))
     again.daemon = True
     again.start()

@@ -7,6 +7,7 @@ import re
 import shutil
 import textwrap
 from collections.abc import Iterable, Sequence
+from decimal import Decimal
 
 # Line length, characters: that of the terminal, within these limits.
 WIDTH, NARROWEST = 100, 40
@@ -36,31 +37,26 @@ def number(value: float | None) -> str:
         return "–"
     if isinstance(value, int):
         return str(value)
+    shown = f"{value:.3e}"
     if value == 0 or 1e-3 <= abs(value) < 1e6:
-        rounded = float(f"{abs(value):.3e}")  # 999.96 is 1000, not 1000.0
-        decimals = 0 if value == 0 else max(0, 3 - math.floor(math.log10(rounded)))
-        return f"{value:.{decimals}f}".replace("-", "−")
-    return f"{value:.3e}".replace("-", "−")
+        exponent = int(shown.partition("e")[2]) if value else 3  # 999.96 is 1000, not 1000.0
+        shown = f"{value:.{max(0, 3 - exponent)}f}"
+    return shown.replace("-", "−")
 
 
 def significant(value: float, digits: int = 2) -> str:
     """Write a number with a few significant digits and no exponent: 138.4, 2 gives "140"."""
-    if value == 0 or not math.isfinite(value):
-        return f"{value:.0f}"
-    rounded = float(f"{value:.{digits}g}")
-    decimals = max(0, digits - 1 - math.floor(math.log10(abs(rounded))))
-    text = f"{rounded:.{decimals}f}"
-    return text.rstrip("0").rstrip(".") if "." in text else text
+    rounded = f"{value:.{digits}g}"
+    return f"{Decimal(rounded):f}" if math.isfinite(value) else rounded
 
 
 def rounded(value: float, within: float) -> str:
     """Write a number with three digits, or more to keep it within a relative difference."""
-    for digits in range(3, 12):
-        near = float(f"{value:.{digits}g}")
-        if abs(near - value) <= within * abs(value):
+    for decimals in range(2, 11):
+        near = f"{value:.{decimals}e}"
+        if abs(float(near) - value) <= within * abs(value):
             break
-    decimals = digits - 1 - math.floor(math.log10(abs(near))) if near else 0
-    return f"{near:.{max(decimals, 0)}f}"
+    return f"{Decimal(near):f}" if value else "0"
 
 
 def percent(share: float, digits: int = 2) -> str:

@@ -11,7 +11,7 @@ from foamfit.data.csv_file import read_test
 from foamfit.data.frames import Frames, join
 from foamfit.data.measurement import Record
 from foamfit.fitting.problem import make_problem
-from foamfit.study.batch_work import Recipe, fingerprint
+from foamfit.study.batch import Recipe, fingerprint
 from foamfit.study.study_file import find_tests
 
 LAST = 4e-3  # s

@@ -15,9 +15,15 @@ from foamfit.fitting.problem import make_problem
 from foamfit.fitting.together import Together
 from foamfit.parts import ParameterEstimate
 from foamfit.report.figures import images
-from foamfit.study.joint_fit import Alternative, fit_jointly
-from foamfit.study.joint_parameters import result_of
-from foamfit.study.joint_result import JointResult, JointTest, joint_page, plot_joint
+from foamfit.study.joint_fit import fit_jointly
+from foamfit.study.joint_result import (
+    Alternative,
+    JointResult,
+    JointTest,
+    joint_page,
+    plot_joint,
+    result_of,
+)
 from foamfit.study.study_file import Study
 
 RATES = (0.01, 0.1, 1.0)
@@ -62,9 +68,8 @@ def found(tmp_path_factory) -> JointResult:
         Alternative("s1_sigma_plus", "own", False, 14.0, 14, 299.0),
     )
     files, alone = dict.fromkeys(names, here), Together.of_own_fits(problems, vectors)
-    made = result_of(
-        study, files, RATES, 0.1, fit, alone, {}, evidence=evidence, refused={}, runtime_s=1.0
-    )
+    about = {"rate0": 0.1, "evidence": evidence, "refused": {}, "runtime_s": 1.0}
+    made = result_of(study, files, RATES, fit, alone, {}, **about)
     words = {"warnings": ("x.csv is left out: it holds <nothing>.",), "sentences": ("Said.",)}
     return replace(made, status="warnings", **words)
 

@@ -25,8 +25,7 @@ from conftest import HEIGHT, Inline, run, run_refused, synthetic_impact, write_c
 from foamfit.cli import fit as command
 from foamfit.report.listing import Row, row_of, write_comparison, write_page
 from foamfit.study import batch as module
-from foamfit.study import batch_work
-from foamfit.study.batch_work import work
+from foamfit.study.batch import work
 from foamfit.terminal import TerminatedError
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
@@ -65,7 +64,7 @@ def tried(monkeypatch):
         found.append(test.name)
         return fabricated.result(measurement=test)
 
-    monkeypatch.setattr(batch_work, "fit", fit)
+    monkeypatch.setattr(module, "fit", fit)
     return found
 
 
@@ -121,7 +120,7 @@ def test_a_cycle_is_a_row_and_its_folder_is_in_that_of_the_test(here, monkeypatc
         results = {1: fabricated.result(), 2: fabricated.result(status="ok")}
         return ff.CycleFits("a", "bistable", (1, 2, 3), results, {3: "it is cut"})
 
-    monkeypatch.setattr(batch_work, "fit_cycles", fit_cycles)
+    monkeypatch.setattr(module, "fit_cycles", fit_cycles)
     frame = again(cycle="all").set_index("test")
     assert list(frame.index[:3]) == ["a/cycle-1", "a/cycle-2", "a/cycle-3"]
     assert list(frame["status"][:3]) == ["warnings", "ok", "refused"]
@@ -166,7 +165,7 @@ def test_a_defect_is_a_row_and_ends_nothing(here, tried, monkeypatch):
             raise ZeroDivisionError("of b")
         return fabricated.result(measurement=test)
 
-    monkeypatch.setattr(batch_work, "fit", fit)
+    monkeypatch.setattr(module, "fit", fit)
     row = again().set_index("test").loc["b"]
     assert row["status"] == "refused"
     assert "defect of foamfit, please report it (ZeroDivisionError: of b)" in row["error"]
@@ -174,7 +173,7 @@ def test_a_defect_is_a_row_and_ends_nothing(here, tried, monkeypatch):
 
 def unfitted(task):
     """Work in another process with a fast fit; at module level so that it can be pickled."""
-    batch_work.fit = lambda test, **_: fabricated.result(measurement=test)
+    module.fit = lambda test, **_: fabricated.result(measurement=test)
     return work(task)
 
 
@@ -221,7 +220,7 @@ def test_ctrl_c_and_sigterm_leave_what_is_done_and_a_summary(here, tried, end):
 
 
 def test_a_full_disk_ends_in_one_sentence_and_loses_nothing(here, tried, monkeypatch):
-    real, written = batch_work.write_result, []
+    real, written = module.write_result, []
 
     def write_result(result, folder, **options):
         if written:
@@ -229,19 +228,19 @@ def test_a_full_disk_ends_in_one_sentence_and_loses_nothing(here, tried, monkeyp
         written.append(1)
         real(result, folder, **options)
 
-    monkeypatch.setattr(batch_work, "write_result", write_result)
+    monkeypatch.setattr(module, "write_result", write_result)
     with pytest.raises(ff.InputError, match=r"No space left.*1 of 4 tests are done and kept"):
         again()
     assert list(numbers("out")) == ["a"]
     assert not [name for name in names("out") if name.startswith(".")]
-    monkeypatch.setattr(batch_work, "write_result", real)
+    monkeypatch.setattr(module, "write_result", real)
     tried.clear()
     again()
     assert tried == ["b", "c"]
 
 
 def test_memory_errors_and_other_versions_are_not_the_fault_of_a_test(here, monkeypatch):
-    monkeypatch.setattr(batch_work, "fit", lambda *_, **__: (_ for _ in ()).throw(MemoryError()))
+    monkeypatch.setattr(module, "fit", lambda *_, **__: (_ for _ in ()).throw(MemoryError()))
     frame = again().set_index("test")
     assert "its fit was lost (MemoryError" in frame.loc["a", "error"]
     # There is no result of the test, so the next call retries it.

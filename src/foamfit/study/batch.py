@@ -1,22 +1,35 @@
-"""Separate fits of many tests: parallel, resumable, with a folder per test and one summary."""
+"""Separate fits of many tests: parallel, resumable, with a folder per test and one summary.
+
+`work` is done in another process: its arguments and results can be pickled, and a test depends
+only on its task.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+import platform
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent import futures
 from concurrent.futures import Executor, Future
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from contextlib import chdir, nullcontext, suppress
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Unpack
+from typing import TYPE_CHECKING, Any, Literal, Unpack
 
 import numpy as np
 
-from foamfit.data.toml_file import toml_beside
-from foamfit.errors import InputError, check_whole
-from foamfit.files import is_left, reason, sweep
+from foamfit.api import fit
+from foamfit.codec import build, plain
+from foamfit.data.csv_file import read_test
+from foamfit.data.toml_file import motion_file, toml_beside
+from foamfit.errors import InputError, SimulationError, check_whole
+from foamfit.files import is_left, read_whole, reason, sweep
 from foamfit.fitting import nuisance
 from foamfit.fitting.problem import check_fixed_and_varied
 from foamfit.one_model import Options
@@ -24,11 +37,20 @@ from foamfit.options import Keywords
 from foamfit.parts import law_in_words
 from foamfit.report import listing as tables
 from foamfit.report.figures import TWO, inches
-from foamfit.report.folder import FILES, check_target, is_written
-from foamfit.report.listing import Row
+from foamfit.report.folder import (
+    FILES,
+    check_target,
+    is_written,
+    save_whole,
+    write_json,
+    write_result,
+)
+from foamfit.report.listing import REFUSED, Row, row_of
+from foamfit.results import stamp
 from foamfit.solve import precompile
+from foamfit.springs import laws
 from foamfit.springs.model import Model, with_options
-from foamfit.study.batch_work import Recipe, Task, fingerprint, stored, work
+from foamfit.study.cycles import fit_cycles
 from foamfit.study.processes import FITS, PAGES, EndedError, Processes, cores
 from foamfit.study.study_file import find_tests
 from foamfit.terminal import without_ctrl_c
@@ -39,6 +61,10 @@ if TYPE_CHECKING:
 
 MOST_AHEAD = 1000  # tests submitted to the executor at a time
 PAUSE = 60.0  # least time between two summaries, s: of many tests, one takes seconds
+VERSION = version("foamfit")
+RECORD = "batch.json"  # in the folder of each test: its rows, and the fingerprint of their inputs
+# One fit at a time per process, also in an executor with threads: drawing is not thread-safe.
+_ALONE = threading.Lock()
 Tests = str | Path | Iterable[str | Path]
 Cycles = int | Sequence[int] | Literal["all"] | None
 
@@ -70,15 +96,13 @@ class Batch:
 
     def save(self, *, whole: bool = False) -> None:
         """Write summary.csv and summary.html; `whole` adds a comparison of the parameters."""
-        rows = self.summary
+        rows, recipe, picture = self.summary, self.recipe, None
         tables.write_summary(rows, self.out)
-        options = Options(**self.recipe.options)
-        model = with_options(self.recipe.model, **options.of_springs)
-        law = law_in_words(model, options.relaxation)
-        title, picture = f"{self.out.resolve().name}: {law}", None
+        law = law_in_words(recipe.model, recipe.options["relaxation"])
+        title = f"{self.out.resolve().name}: {law}"
         if whole:
-            pictures, width = self.recipe.pages, self.recipe.width
-            picture = tables.write_comparison(rows, self.out, title, width=width, pictures=pictures)
+            how: Any = {"width": recipe.width, "pictures": recipe.pages}
+            picture = tables.write_comparison(rows, self.out, title, **how)
         tables.write_page(rows, self.out, title, picture)
 
     def fit(self, executor: Executor) -> None:
@@ -108,13 +132,12 @@ class Batch:
     def _begin(self, executor: Executor, name: str, path: Path) -> None:
         """Use the stored rows of a test, or submit its fit."""
         toml = toml_beside(path) if self.toml is None else self.toml
-        folder = self.out / name
         mark = fingerprint(self.recipe, path, toml)
-        rows = None if self.fresh else stored(folder, mark, self.recipe)
+        task = Task(name, path, toml, self.recipe, mark, self.out / name)
+        rows = None if self.fresh else stored(task)
         if rows is not None:
             self._keep(name, tuple(replace(row, file=str(path)) for row in rows))
             return
-        task = Task(name, path, toml, self.recipe, mark, folder)
         try:
             self.waiting[executor.submit(work, task)] = task
         except RuntimeError as error:  # the executor was shut down
@@ -135,10 +158,14 @@ class Batch:
             rows = future.result()
         except (futures.BrokenExecutor, futures.CancelledError, InputError):
             raise  # the result cannot be written, or no other test can be fitted
-        except Exception as error:
-            self._keep(task.name, (Row(task.name, str(task.path), tables.REFUSED, _lost(error)),))
-            return
-        self.fitted += 1
+        except Exception as error:  # its cause may lie outside the test
+            kind = type(error).__name__
+            why = f"its fit was lost ({kind}: {error})"
+            if isinstance(error, EndedError) or kind == "KilledWorker":  # raised by Dask
+                why = "its process ended before it was fitted (killed, or out of memory)"
+            rows = task.refused(f"{why}; call again to retry")
+        else:
+            self.fitted += 1
         self._keep(task.name, rows)
 
     def _keep(self, name: str, rows: tuple[Row, ...]) -> None:
@@ -240,7 +267,8 @@ def batch(
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {reason(error)}") from None
     try:
-        with _executor(executor, jobs, made) as runner:
+        given = None if executor is None else nullcontext(executor)
+        with given or _processes(recipe, jobs, len(found)) as runner:
             made.fit(runner)
     finally:  # a process that was killed may have left half a folder
         sweep(folder.resolve(), [name for name, _ in found])
@@ -284,23 +312,146 @@ def _check_out(out: Path) -> None:
         raise InputError(f"{out} cannot be written: {reason(error)}") from None
 
 
-@contextmanager
-def _executor(given: Executor | None, jobs: int | None, made: Batch) -> Iterator[Executor]:
-    """Yield the given executor, or else processes of this machine, which end with the body."""
-    if given is not None:
-        yield given
-        return
-    precompile.compile_solver(made.recipe.model)
-    count = min(jobs or cores(), max(len(made.tests), 1))
-    with Processes(count, (*FITS, *(PAGES if made.recipe.pages else ()))) as pool:
-        yield pool
+def _processes(recipe: Recipe, jobs: int | None, tests: int) -> Processes:
+    precompile.compile_solver(recipe.model)
+    return Processes(min(jobs or cores(), tests), (*FITS, *(PAGES if recipe.pages else ())))
 
 
-def _lost(error: Exception) -> str:
-    """Return why a test has no result if the cause may lie outside the test."""
-    if isinstance(error, EndedError) or type(error).__name__ == "KilledWorker":  # raised by Dask
-        return (
-            "its process ended before it was fitted (killed, or out of memory); call again to retry"
-        )
-    why = " ".join(f"{type(error).__name__}: {error}".split())
-    return f"its fit was lost ({why}); call again to retry"
+@dataclass(frozen=True)
+class Recipe:
+    """How every test of a batch is fitted.
+
+    `cycles` is one number, several, () for all cycles of a record, or None for the cycle that the
+    TOML names; `options` are keywords of `foamfit.fit`.
+    """
+
+    model: str
+    options: Mapping[str, Any]
+    cycles: int | tuple[int, ...] | None = None
+    pages: bool = True
+    width: str = TWO  # of the figures
+    laws: Mapping[str, str] = field(default_factory=laws.texts)  # texts of the user's law files
+    history: tuple[int, int] | None = None  # first and last of several cycles fitted as one
+
+    @property
+    def key(self) -> str:
+        """Settings and version that determine the results; `stored` checks pages and width."""
+        parts = asdict(replace(self, pages=True)) | {"foamfit": VERSION}
+        del parts["width"]
+        texts = parts.pop("laws")
+        if any(laws.is_registered(kind) for kind in self.model.split("+")):
+            parts["laws"] = sorted(texts.values())
+        return json.dumps(parts, sort_keys=True)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One test to be fitted; `out` is the folder to write.
+
+    Relative paths count from `where`. `fingerprint` is that of the files as the caller sees them.
+    """
+
+    name: str
+    path: Path
+    toml: Path
+    recipe: Recipe
+    fingerprint: str
+    out: Path
+    where: Path = field(default_factory=Path.cwd)
+
+    def refused(self, why: str) -> tuple[Row, ...]:
+        """Return the row of a test without a result."""
+        return (Row(self.name, str(self.path), REFUSED, " ".join(why.split())),)
+
+
+def fingerprint(recipe: Recipe, path: Path, toml: Path) -> str:
+    """Return a hash of everything that determines a result: settings, version and files."""
+    try:
+        parts = [read_whole(path)]
+        for other in (toml, motion_file(toml)):
+            if other is not None and other.is_file():
+                parts.append(other.read_bytes())
+    except OSError:  # the fit reads the test again, with a better error message
+        parts = []
+    digests = (hashlib.sha256(part).hexdigest() for part in parts)
+    return hashlib.sha256(json.dumps([recipe.key, *digests]).encode()).hexdigest()
+
+
+def stored(task: Task) -> tuple[Row, ...] | None:
+    """Return the rows in a test's folder if they have its fingerprint, else None.
+
+    If the recipe includes figures, they must exist and have its width.
+    """
+    # There may be no record, or one of another version.
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        content = json.loads((task.out / RECORD).read_text(encoding="utf-8"))
+        width = content.get("figure_width", inches(TWO)) if content["pages"] else None
+        drawn = not task.recipe.pages or width == inches(task.recipe.width)
+        if drawn and content["fingerprint"] == task.fingerprint:
+            return tuple(build(Row, row, {}) for row in content["rows"])
+    return None
+
+
+def work(task: Task) -> tuple[Row, ...]:
+    """Fit one test, write its folder at once and return its rows; an error becomes a row.
+
+    Raises InputError if the result cannot be written, and RuntimeError on a machine where the test
+    or foamfit is not that of the caller.
+    """
+    with _ALONE:
+        laws.load_texts(task.recipe.laws)
+        if task.where.is_dir():
+            with chdir(task.where):
+                if fingerprint(task.recipe, task.path, task.toml) == task.fingerprint:
+                    return _written(task)
+    raise RuntimeError(
+        f"{platform.node()} does not see the same files or has another version of foamfit; every "
+        "worker must see the file system of the call"
+    )
+
+
+def _written(task: Task) -> tuple[Row, ...]:
+    write: Callable[[Path], None] = lambda _: None  # noqa: E731
+    try:
+        rows, write = _results(task)
+    except (InputError, SimulationError) as error:
+        rows = task.refused(str(error))
+    except (MemoryError, OSError):  # a fault of this machine, not of the test
+        raise
+    except Exception as error:
+        fault = f"{type(error).__name__}: {error}"
+        rows = task.refused(f"this is a defect of foamfit, please report it ({fault})")
+    record = {
+        **stamp(),
+        "fingerprint": task.fingerprint,
+        "pages": task.recipe.pages,
+        "figure_width": inches(task.recipe.width),
+        "rows": plain(rows, {}),
+    }
+
+    def fill(folder: Path) -> None:
+        write(folder)
+        write_json(folder / RECORD, record)
+
+    save_whole(task.out, fill, swept=True)
+    return rows
+
+
+def _results(task: Task) -> tuple[tuple[Row, ...], Callable[[Path], None]]:
+    """Return one row, or one per cycle (a subfolder), and a function that writes the files."""
+    recipe, path, file = task.recipe, task.path, str(task.path)
+    pictures: Any = {"pages": recipe.pages, "width": recipe.width}
+    if not isinstance(recipe.cycles, tuple):
+        test = read_test(path, task.toml, recipe.cycles, cycles=recipe.history)
+        result = fit(test, model=recipe.model, **recipe.options)
+        return (row_of(task.name, file, result),), partial(write_result, result, **pictures)
+    numbers = recipe.cycles or None
+    fits = fit_cycles(path, task.toml, cycles=numbers, model=recipe.model, **recipe.options)
+    rows = list[Row]()
+    for number in sorted({*fits.results, *fits.refused}):
+        name = f"{task.name}/cycle-{number}"
+        if number in fits.results:
+            rows.append(row_of(name, file, fits.results[number]))
+        else:
+            rows.append(Row(name, file, REFUSED, " ".join(fits.refused[number].split())))
+    return tuple(rows), partial(fits.write, **pictures)

@@ -20,7 +20,6 @@ from foamfit.one_model import Options, Progress, part_of
 from foamfit.options import Keywords
 from foamfit.parts import ParameterEstimate
 from foamfit.report import figures
-from foamfit.report.figures import TWO
 from foamfit.report.folder import Result, brief, write_json, write_result, write_table, write_text
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import own_name
@@ -71,9 +70,9 @@ class CycleFits(Result):
     def rows(self) -> Iterator[dict[str, Any]]:
         """Yield the rows of cycles.csv in SI, one per cycle; None for missing values."""
         every = {n: self.results.get(n) for n in sorted({*self.results, *self.refused})}
-        parameters = wide([{} if one is None else one.parameters for one in every.values()])
-        names = ["start_strain", "peak_strain", "peak_stress", ENERGY]
-        names += [f"misfit_{name}" for name in CURVES]
+        parameters = wide([one.parameters if one else {} for one in every.values()])
+        misfits = (f"misfit_{name}" for name in CURVES)
+        names = ["start_strain", "peak_strain", "peak_stress", ENERGY, *misfits]
         for (number, one), own in zip(every.items(), parameters, strict=True):
             cells: list[Any] = [None] * len(names)
             status = "refused"
@@ -188,10 +187,9 @@ def fit_cycles(
     if not wanted:
         raise InputError("no cycle is given; give at least one, or omit cycles to fit all")
     results, refused = dict[int, Fit](), dict[int, str]()
-    stopped = None
+    stopped, count = None, len(wanted)
     for i, number in enumerate(wanted):
-        begin, end = i / len(wanted), (i + 1) / len(wanted)
-        notify = part_of(report, begin, end, f"cycle {number}: ")
+        notify = part_of(report, i / count, (i + 1) / count, f"cycle {number}: ")
         try:
             test = first if number == first.cycle else read_test(path, specimen, number)
             results[number] = fit(test, model=model, progress=notify, tell=tell, **options)
@@ -210,7 +208,7 @@ def fit_cycles(
     return CycleFits(first.name, model, first.cycles, results, refused, *made)
 
 
-def plot_cycles(found: CycleFits, *, width: str = TWO) -> Figure:
+def plot_cycles(found: CycleFits, *, width: str = figures.TWO) -> Figure:
     """Draw all loops in one panel, and start strain, energy, misfit and parameters by cycle.
 
     For the parameters see `plot_parameters`. At most `MOST_LOOPS` loops are drawn.

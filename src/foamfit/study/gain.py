@@ -10,8 +10,8 @@ factor by which the ranges of the tests at hand exceed this.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -22,7 +22,7 @@ from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.branches import unreached
 from foamfit.fitting.problem import Problem, make_params, make_problem
-from foamfit.report.studies.plan import Expected, Quantity
+from foamfit.report.studies.plan import Expected
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Impact
 from foamfit.springs.parameters import NUISANCE
@@ -65,11 +65,6 @@ class Known:
     def drawn_sizes(self) -> Array:
         """Scale of each parameter in each draw over `sizes`, (d, k)."""
         return np.array([self.problem.sizes(self.names, one) for one in self.draws]) / self.sizes
-
-    def first(self, count: int) -> Known:
-        """Return the same with the first draws only."""
-        few = {name: getattr(self, name)[:count] for name in ("draws", "bread", "meat")}
-        return replace(self, **few)
 
     def with_springs(self, drawn: Array, problem: Problem) -> Array:
         """Return the parameters of another test: drawn springs, and its nuisance parameters."""
@@ -121,8 +116,7 @@ def problem_for(
     With `with_motion` the motion counts even if the rig does not record it.
     """
     problem, test = known.problem, known.problem.measurement
-    lasts, peak = 0.0, problem.scales.stress
-    impact = candidate.drive == "impact"
+    lasts, peak, impact = 0.0, problem.scales.stress, candidate.drive == "impact"
     if impact:
         lasts, peak = _duration_and_peak(known, candidate, peak)
     record = candidate.recorded(test, rig, lasts, peak, with_motion=with_motion)
@@ -169,7 +163,8 @@ def look(
     reached, broken = np.zeros((d, k), dtype=bool), np.ones(d, dtype=bool)
     missed, forces, apart = np.zeros(d), list[float](), dict[str, list[float]]()
     usual = max(known.share.values(), default=0.0)  # of curves that no test at hand has
-    others = {name: Rival.of(one, candidate, rig, each) for name, one in (rivals or {}).items()}
+    made = {n: _excess_over(one, candidate, rig, each) for n, one in (rivals or {}).items()}
+    others = {name: excess for name, excess in made.items() if excess is not None}
     for i, drawn in enumerate(known.draws):
         values = known.with_springs(drawn, problem)
         try:
@@ -192,49 +187,42 @@ def look(
             share = known.share.get(curve, usual)
             off = share * float(np.ptp(shown.curves[curve]))
             missed[i] += each * size * (off * objective.factor(curve)) ** 2
-        for name, rival in others.items():
-            if rival is not None:
-                found = rival.excess(objective.compare(shown, values)) / (1.0 + missed[i])
-                apart.setdefault(name, []).append(found)
+        for name, excess in others.items():
+            found = excess(objective.compare(shown, values)) / (1.0 + missed[i])
+            apart.setdefault(name, []).append(found)
     told = {name: float(np.median(found)) for name, found in apart.items()}
     force = float(np.median(forces)) if forces else math.nan
     return Seen(bread, meat, reached, broken, missed, force, told)
 
 
-@dataclass(frozen=True, eq=False)
-class Rival:
-    """Another law at its best point for a candidate."""
+def _excess_over(
+    known: Known, candidate: Candidate, rig: Rig, weight: float
+) -> Callable[[Array], float] | None:
+    """Return the χ² of residuals that remains after a fit of another law, to first order.
 
-    residual: Array  # of its curves against the same placeholders
-    rows: Array  # slopes by all its parameters; below them the information on these
-    weight: float
+    The law is simulated at its best point for a candidate; None if it cannot be.
+    """
+    k = len(known.names)
+    try:
+        problem = problem_for(known, candidate, rig)
+        values = known.with_springs(known.values, problem)
+        shown = problem.objective.simulate(values)
+    except SimulationError:
+        return None
+    n = problem.objective.n_data
+    rows = math.sqrt(weight) * rows_of(problem, values, known.names, known.sizes)[:n]
+    root = np.linalg.cholesky(known.bread[0] + TINY * np.eye(k)).T
+    rows = np.vstack([rows, np.hstack([np.zeros((k, rows.shape[1] - k)), root])])
+    own = problem.objective.compare(shown, values)[:n]
 
-    @classmethod
-    def of(cls, known: Known, candidate: Candidate, rig: Rig, each: float) -> Rival | None:
-        """Return the rival; None if it cannot be simulated."""
-        k = len(known.names)
-        try:
-            problem = problem_for(known, candidate, rig)
-            values = known.with_springs(known.values, problem)
-            shown = problem.objective.simulate(values)
-        except SimulationError:
-            return None
-        n = problem.objective.n_data
-        rows = rows_of(problem, values, known.names, known.sizes)[:n]
-        root = np.linalg.cholesky(known.bread[0] + TINY * np.eye(k)).T
-        prior = np.hstack([np.zeros((k, rows.shape[1] - k)), root])
-        residual = problem.objective.compare(shown, values)[:n]
-        return cls(residual, np.vstack([math.sqrt(each) * rows, prior]), each)
-
-    def excess(self, residual: Array) -> float:
-        """Return the χ² that remains when the rival is fitted to the curves, to first order."""
-        n = self.residual.size
+    def excess(residual: Array) -> float:
         if residual.size < n:
             return 0.0
-        apart = math.sqrt(self.weight) * (residual[:n] - self.residual)
-        apart = np.append(apart, np.zeros(len(self.rows) - n))
-        left = apart - self.rows @ np.linalg.lstsq(self.rows, apart, rcond=1e-10)[0]
+        apart = np.append(math.sqrt(weight) * (residual[:n] - own), np.zeros(k))
+        left = apart - rows @ np.linalg.lstsq(rows, apart, rcond=1e-10)[0]
         return float(left @ left)
+
+    return excess
 
 
 def covariance(known: Known, seen: Sequence[Seen], floor: float = TINY) -> tuple[Array, Array]:
@@ -360,7 +348,3 @@ class Target:
     def middle(self) -> float:
         """Median of the quantity over the draws, SI."""
         return float(np.nanmedian(self.values))
-
-    def shown(self, known: Known) -> Quantity:
-        """Return the quantity as it is known now."""
-        return Quantity(self.text, self.unit, self.middle, self.error(known, []))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from statistics import median_low
 
 import lmfit
 import numpy as np
+from scipy import stats
 
 from foamfit.arrays import Array, single_threaded
 from foamfit.data.csv_file import read_test
@@ -22,16 +23,15 @@ from foamfit.fitting.links import KINDS, RATES, Links
 from foamfit.fitting.objective import Spent
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params
 from foamfit.fitting.search import Tracker, descend
-from foamfit.fitting.together import Together
+from foamfit.fitting.together import Together, fit_linked
 from foamfit.one_model import Options, Progress, identify
 from foamfit.report.folder import check_target
 from foamfit.springs.model import Model
-from foamfit.study import joint_fit
-from foamfit.study.joint_fit import fit_jointly
-from foamfit.study.joint_parameters import result_of
-from foamfit.study.joint_result import JointResult
+from foamfit.study.joint_fit import Vectors, fit_jointly
+from foamfit.study.joint_result import Alternative, JointResult, result_of
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
+from foamfit.trust import covariance
 from foamfit.trust.settle import keep_to_record, weigh_motion
 
 # Number of tests fitted by a full search; the others start at the results of these.
@@ -47,13 +47,21 @@ SAME_RATE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class _Test:
-    """One test of a study, ready to be fitted."""
+    """One test of a study, and its fit by itself."""
 
     name: str
     file: Path
     problem: Problem
     params: lmfit.Parameters  # Before any fit
     rate: float | None  # 1/s
+    values: Array = field(default_factory=lambda: np.empty(0))  # Parameters of the fit, SI
+    cost: float = math.nan  # χ² per sample
+
+    def fitted(self, problem: Problem, tracker: Tracker, values: Array) -> _Test:
+        """Return it with the result of a search or a descent, whose evaluations do not count."""
+        objective = replace(problem.objective, spent=Spent())
+        problem, cost = replace(problem, objective=objective), tracker.best_cost / objective.n_data
+        return replace(self, problem=problem, values=values, cost=cost)
 
 
 @single_threaded
@@ -106,15 +114,15 @@ def joint(
     tell(0.5, "together")
     auto = [name for name, kind in study.kinds.items() if kind == AUTO and name in alone.own]
     if auto:
-        links = joint_fit.choose_kinds(alone.problems, links, auto, starts, alone.n_eff, kinds)
+        links = choose_kinds(alone, links, auto, starts, kinds)
     fit = fit_jointly(alone.problems, links, starts)
     tell(0.9, "evidence")
     every = (*fit.found.shared, *fit.found.own)
     compared = [name for name in every if links.kind(name) in RATES or name in auto]
-    tried, slopes = joint_fit.evidence(fit.found, compared, alone.n_eff, kinds, [alone.values])
-    files, rate0 = {test.name: test.file for test in tests}, _median_rate(rates)
-    about = {"evidence": tried, "refused": refused, "runtime_s": time.perf_counter() - began}
-    result = result_of(study, files, rates, rate0, fit, alone, slopes, **about)
+    tried, slopes = evidence(fit.found, compared, kinds, alone)
+    files, took = {test.name: test.file for test in tests}, time.perf_counter() - began
+    about = {"evidence": tried, "refused": refused, "runtime_s": took, "rate0": _median_rate(rates)}
+    result = result_of(study, files, rates, fit, alone, slopes, **about)
     tell(1.0, "done")
     if out is not None:
         result.save(out, report=report)
@@ -142,29 +150,24 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
             found.append((name, path, test))
         except (InputError, SimulationError) as error:
             refused[str(path)] = str(error)
-    if len(found) < 2:
-        _too_few(study, len(found), refused)
-    all_params = _params(study, [test for _, _, test in found])
-    tests = list[_Test]()
-    for (name, path, test), params in zip(found, all_params, strict=True):
+    _check_two(study, len(found), refused)
+    tests, every = list[_Test](), _params(study, [test for _, _, test in found])
+    for (name, path, test), params in zip(found, every, strict=True):
         problem = options.problem(test, study.model, params)
         tests.append(_Test(name, path, problem, params, loading_rate(test)))
     return tests, refused
 
 
-def _too_few(study: Study, count: int, refused: Mapping[str, str]) -> NoReturn:
-    reasons = "; ".join(list(refused.values())[:2])
-    raise InputError(
-        f"{study.path}: {counted(count, 'test')} of {len(study.tests)} can be used, but a joint "
-        f"fit needs two: {reasons}"
-    )
+def _check_two(study: Study, count: int, refused: Mapping[str, str]) -> None:
+    if count < 2:
+        raise InputError(
+            f"{study.path}: {counted(count, 'test')} of {len(study.tests)} can be used, but a "
+            f"joint fit needs two: {'; '.join(list(refused.values())[:2])}"
+        )
 
 
 def _params(study: Study, tests: Sequence[Measurement]) -> list[lmfit.Parameters]:
-    """Return the parameters of each test.
-
-    A named parameter varies in the tests in which it varies by default, or else in all tests.
-    """
+    """Return the parameters; a named one varies where it does by default, or else in all tests."""
     model = Model.parse(study.model, study.relaxation)
     drives = [study.drive or choose_drive(test, study.kinds) for test in tests]
     every = [make_params(test, model, by) for test, by in zip(tests, drives, strict=True)]
@@ -195,25 +198,22 @@ def _links(study: Study, tests: Sequence[_Test]) -> Links:
         if kind not in RATES:
             continue
         if untimed := [test.file for test in free if test.rate is None]:
-            raise InputError(
-                f"{where} needs the strain rate of every test, but {untimed[0]} has no time"
-            )
+            why = f"{where} needs the strain rate of every test, but {untimed[0]} has no time"
+            raise InputError(why)
         if not _several([test.rate for test in free]):
             rate = f"{free[0].rate:.3g} 1/s" if free else "none"
             raise InputError(
                 f"{where} needs tests at two or more rates, and all have one ({rate}); make it "
                 '"shared" or "own", or add tests'
             )
-    middle = _median_rate(rates)
-    if middle is None:
+    if (middle := _median_rate(rates)) is None:
         return Links(study.kinds)
     return Links(study.kinds, np.log([(rate or middle) / middle for rate in rates]))
 
 
 def _median_rate(rates: Sequence[float | None]) -> float | None:
-    """Return the median of the known rates; for an even number, the lower of the middle two."""
-    known = sorted(rate for rate in rates if rate is not None)
-    return known[(len(known) - 1) // 2] if known else None
+    known = [rate for rate in rates if rate is not None]
+    return median_low(known) if known else None
 
 
 def _several(rates: Sequence[float | None]) -> bool:
@@ -233,16 +233,14 @@ def _own_fits(
     order = sorted(range(len(tests)), key=lambda t: (tests[t].rate or 0.0, t))
     places = np.unique(np.linspace(0, len(order) - 1, min(SEARCHED, len(order))).astype(int))
     first = [order[place] for place in places]
-    found = dict[int, _Own]()
+    found = dict[int, _Test]()
 
     def do(chosen: Sequence[int], near: tuple[Array, ...], done: float) -> None:
         for i, t in enumerate(chosen):
-            test = tests[t]
-            fitted = _own_fit(test.problem.measurement, study.model, test.params, options, near)
-            if isinstance(fitted, str):
-                refused[str(tests[t].file)] = fitted
-            else:
-                found[t] = fitted
+            try:
+                found[t] = _own_fit(tests[t], study.model, options, near)
+            except SimulationError as error:
+                refused[str(tests[t].file)] = str(error)
             tell(done + 0.2 * (i + 1) / len(chosen), "each test")
 
     do(first, (), 0.1)
@@ -250,60 +248,112 @@ def _own_fits(
     worst = max((found[t].cost for t in first if t in found), default=math.inf)
     do([t for t in order if t not in first], near, 0.3)
     do([t for t in order if t not in first and t in found and found[t].cost > FAR * worst], (), 0.3)
-    if len(found) < 2:
-        _too_few(study, len(found), refused)
-    kept = list[_Test]()
-    for t, fitted in sorted(found.items()):
-        problem, test = fitted.problem, replace(tests[t], problem=fitted.problem)
-        if problem.objective.drive == "impact" and test.rate is not None:
+    _check_two(study, len(found), refused)
+    kept = [found[t] for t in sorted(found)]
+    for t, test in enumerate(kept):
+        objective, measurement = test.problem.objective, test.problem.measurement
+        if objective.drive == "impact" and test.rate is not None:
             # The rate of the fitted motion, which has no noise.
-            simulated = problem.objective.simulate(fitted.values, everything=True)
-            rate = loading_rate(problem.measurement, simulated.curves["displacement_time"])
-            test = replace(test, rate=rate)
-        kept.append(test)
-    vectors = [fitted.values for _, fitted in sorted(found.items())]
-    return kept, Together.of_own_fits([test.problem for test in kept], vectors)
+            motion = objective.simulate(test.values, everything=True).curves["displacement_time"]
+            kept[t] = replace(test, rate=loading_rate(measurement, motion))
+    problems, values = [test.problem for test in kept], [test.values for test in kept]
+    return kept, Together.of_own_fits(problems, values)
 
 
-class _Own(NamedTuple):
-    """The fit of one test by itself."""
-
-    problem: Problem
-    values: Array  # Parameters, SI
-    cost: float  # χ² per sample
-
-    @classmethod
-    def of(cls, problem: Problem, tracker: Tracker, values: Array) -> _Own:
-        """Return the result of a search or a descent; the joint fit counts its own evaluations."""
-        objective = replace(problem.objective, spent=Spent())
-        cost = tracker.best_cost / objective.n_data
-        return cls(replace(problem, objective=objective), values, cost)
-
-
-def _own_fit(
-    measurement: Measurement,
-    model: str,
-    params: lmfit.Parameters,
-    options: Options,
-    near: tuple[Array, ...],
-) -> _Own | str:
-    """Fit one test, starting from the points `near` it or else by a search.
-
-    Returns its result, or the error message.
-    """
+def _own_fit(test: _Test, model: str, options: Options, near: tuple[Array, ...]) -> _Test:
+    """Fit one test, starting from the points `near` it or else by a search."""
+    measurement, params = test.problem.measurement, test.params
     if not near:
-        try:
-            found = identify(measurement, model, params, options, lambda *_: None)
-        except SimulationError as error:
-            return str(error)
-        return _Own.of(found.problem, found.tracker, found.best().values)
+        found = identify(measurement, model, params, options, lambda *_: None)
+        return test.fitted(found.problem, found.tracker, found.best().values)
     problem = options.problem(measurement, model, params)
     space, tracker = problem.space(), Tracker(problem.objective)
     for start in near:
         end = descend(tracker, space, space.encode(problem.with_springs(start)), STEPS)[1]
         tracker.ends.append(space.decode(end))
     if tracker.best_values is None:
-        return _own_fit(measurement, model, params, options, ())
+        return _own_fit(test, model, options, ())
     problem, _ = keep_to_record(problem, tracker, options.vary)
     weigh_motion(problem, tracker)
-    return _Own.of(problem, tracker, tracker.best_values)
+    return test.fitted(problem, tracker, tracker.best_values)
+
+
+def evidence(
+    fit: Together, names: Sequence[str], kinds: Sequence[str], alone: Together
+) -> tuple[tuple[Alternative, ...], dict[str, float]]:
+    """Compare these kinds of each of these parameters, leaving the other parameters as they are.
+
+    Also returns the parameters whose slope with rate the tests do not determine, with `open_slope`.
+    """
+    found, wide = list[Alternative](), dict[str, float]()
+    for name in names:
+        present, near = fit.links.kind(name), [fit.values, alone.values]
+        for kind, other in _kinds_of(fit, name, (present, *kinds), near, wide):
+            bic = other.bic(alone.n_eff)
+            found.append(Alternative(name, kind, kind == present, bic, other.n_vary, other.cost))
+    return tuple(found), wide
+
+
+def choose_kinds(
+    alone: Together, links: Links, names: list[str], starts: Sequence[Vectors], kinds: list[str]
+) -> Links:
+    """Return links in which these parameters have the kinds of least BIC.
+
+    All are shared at first; each round makes the change of one kind that lowers BIC most. A rate
+    law is not tried if the tests do not determine its slope (`open_slope`).
+    """
+    now = fit_linked(alone.problems, links.having(**dict.fromkeys(names, "shared")), starts)
+    n_eff = alone.n_eff
+    while True:
+        trials = [
+            fit
+            for name in names
+            for kind, fit in _kinds_of(now, name, kinds, [now.values, alone.values], {})
+            if kind != now.links.kind(name)
+        ]
+        best = min(trials, key=lambda fit: fit.bic(n_eff), default=now)
+        if best.bic(n_eff) >= now.bic(n_eff):
+            return now.links
+        now = best
+
+
+def _kinds_of(
+    fit: Together, name: str, kinds: Sequence[str], near: Sequence[Vectors], wide: dict[str, float]
+) -> Iterator[tuple[str, Together]]:
+    """Yield fits with each of these kinds of a parameter, and the other parameters as they are.
+
+    Kinds that cannot be simulated are omitted, and rate laws if the slope is not determined, in
+    which case `open_slope` is entered in `wide`.
+    """
+    present = fit.links.kind(name)
+    for kind in sorted(dict.fromkeys(kinds), key=lambda kind: (kind in RATES, kind != present)):
+        if kind in RATES and kind != present and name in wide:
+            continue
+        try:
+            links = fit.links.having(**{name: kind})
+            other = fit if kind == present else fit_linked(fit.problems, links, near)
+        except SimulationError:
+            continue
+        yield kind, other
+        if kind == "own" and any(law in RATES for law in kinds):
+            half = open_slope(other, name)
+            if half > covariance.WEAK:
+                wide[name] = half
+
+
+def open_slope(fit: Together, name: str) -> float:
+    """Return half the 95 % interval of the slope b of a parameter, from its own values.
+
+    The errors of a fit with a rate law do not include the scatter of specimens about the law. With
+    b = 1 a power law is proportional to the rate.
+    """
+    free = [name in problem.free() for problem in fit.problems]
+    values = np.array(fit.value(name))[free]
+    level = float(np.median(values))
+    if fit.links.log_rates is None or values.size < 3 or level == 0.0:
+        return math.inf
+    x = fit.links.log_rates[free]
+    if not np.ptp(x) > 0.0:
+        return math.inf
+    logs = np.log(values / level) if np.all(values / level > 0.0) else values / level
+    return covariance.half_width(float(stats.linregress(x, logs).stderr), values.size - 2)

@@ -1,4 +1,4 @@
-"""The fit of several tests with linked parameters, its uncertainty, and scatter between tests.
+"""The fit of several tests with linked parameters: uncertainty, scatter between tests, states.
 
 The best values of a scattering parameter in the tests, its common value and its spread depend on
 each other. For a given spread, a fit pulls the values towards the common value. The values without
@@ -9,22 +9,26 @@ them (`trust.scatter`). This is repeated until the spread no longer changes (Lap
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
-from scipy import stats
 
 from foamfit.arrays import Array
+from foamfit.data.calibration import contradictions
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import is_logarithmic
 from foamfit.fitting.links import RATES, Links
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import Tracker
 from foamfit.fitting.together import Together, fit_linked
-from foamfit.springs.parameters import NUISANCE, split_name
+from foamfit.parts import ParameterEstimate
+from foamfit.springs.parameters import NUISANCE, split_name, unit_of
+from foamfit.text import counted
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint, JointPoint
+from foamfit.trust.budget import judged, settle, unsettled
 from foamfit.trust.covariance import Ends
 from foamfit.trust.ranges import ITERATIONS, TRIALS, left_open, nearer, tolerance
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
@@ -40,6 +44,8 @@ LEAST_SPREAD = 2.0
 SAYS_NOTHING = 5.0
 GROUPS = 10  # largest number of groups of tests that are left out in turn
 REFIT = 15  # iterations of a fit without one group
+LARGEST = 300.0  # largest logarithm of a common value that the tests do not determine
+_BLANK = ParameterEstimate(math.nan, systematic=None)  # known for the fits of single tests only
 Vectors = Sequence[Array]  # Parameters of each test
 
 
@@ -160,11 +166,11 @@ def ranges_of(point: JointPoint) -> dict[str, Ends]:
     if not point.uncertainty.errs:
         return {}
     out = _over_specimens(point.found)
-    shared = [name for name in point.found.shared if point.found.links.kind(name) == "shared"]
-    for name in shared:
-        held = [_held(point, name, sign) for sign in (-1.0, 1.0)]
-        ends = [*held, point.found.common[name][0], *out.get(name, ())]
-        out[name] = min(ends), max(ends)
+    for name in point.found.shared:
+        if point.found.links.kind(name) == "shared":
+            held = (_held(point, name, sign) for sign in (-1.0, 1.0))
+            ends = [*held, point.found.common[name][0], *out.get(name, ())]
+            out[name] = min(ends), max(ends)
     return out
 
 
@@ -179,7 +185,6 @@ def own_ranges(point: JointPoint, ranges: Mapping[str, Ends]) -> tuple[dict[str,
     for best in point.bests:
         problem, values = best.problem, best.values
         shared = [name for name in best.names if name in point.found.shared]
-        shared = [name for name in shared if point.found.links.kind(name) != "scatter"]
         for name in shared:
             problem = problem.holding(name, best.value(name))
         alone = BestPoint(problem, values)
@@ -200,8 +205,8 @@ def own_ranges(point: JointPoint, ranges: Mapping[str, Ends]) -> tuple[dict[str,
 def _over_specimens(found: Together) -> dict[str, Ends]:
     """Return ranges of shared values and slopes from fits without each group of tests."""
     count = len(found.problems)
-    groups = [range(first, count, GROUPS) for first in range(min(count, GROUPS))]
-    kept = [[t for t in range(count) if t not in group] for group in groups]
+    groups = range(min(count, GROUPS))
+    kept = [[t for t in range(count) if t % GROUPS != group] for group in groups]
     others = [common for one in kept if (common := _without(found, one))]
     if len(others) < 2:
         return {}
@@ -252,98 +257,113 @@ def _held(point: JointPoint, name: str, sign: float) -> float:
     return value
 
 
-@dataclass(frozen=True)
-class Alternative:
-    """A joint fit with one kind of a parameter, as evidence for this kind."""
+def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, ParameterEstimate]:
+    """Return all parameters of the joint fit, those of the springs first."""
+    problems = fit.found.problems
+    found = {
+        name: parameter_of(fit, tests, name)
+        for name in (*problems[0].model.names, *NUISANCE)
+        if any(name in one.index and not one.is_exact(name) for one in problems)
+    }
+    for test, best in zip(tests, fit.point.bests, strict=True):
+        settled = settle(best, unsettled(best, contradictions(best.problem.measurement)))
+        for name in best.problem.free() if settled else ():
+            found[name] = _contested(found[name], test, partial(judged, settled, best, name))
+    return found
 
-    parameter: str
-    kind: str
-    chosen: bool
-    bic: float
-    n_vary: int
-    chi2: float
+
+def _contested(
+    one: ParameterEstimate, test: str, judge: Callable[[Ends, tuple[str, str]], tuple[str, str]]
+) -> ParameterEstimate:
+    """Return a parameter with the states that contradictions in the record of a test leave it."""
+    if one.ci95 is not None and one.state:
+        state, why = judge(one.ci95, (one.state, one.why))
+        one = replace(one, state=state, why=why)
+    if one.tests is None or test not in one.tests:
+        return one
+    own = _contested(one.tests[test], "", judge)
+    return replace(one, tests={**one.tests, test: own})
 
 
-def evidence(
-    fit: Together, names: Sequence[str], n_eff: int, kinds: Sequence[str], near: Sequence[Vectors]
-) -> tuple[tuple[Alternative, ...], dict[str, float]]:
-    """Compare these kinds of each of these parameters, leaving the other parameters as they are.
+def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> ParameterEstimate:
+    """Return one parameter of the joint fit."""
+    found, kind = fit.found, fit.found.links.kind(name)
+    free = [t for t, problem in enumerate(found.problems) if name in problem.free()]
+    each = _values(fit, tests, name)
+    if not free:
+        fixed = next(iter(each.values()))
+        value = float(np.median([one.value for one in each.values()]))
+        return replace(fixed, value=value, kind="fixed")
+    if kind == "own":
+        value = float(np.median([each[tests[t]].value for t in free]))
+        why = "one value for each test; this is their median"
+        return replace(_BLANK, value=value, unit=unit_of(name), why=why, kind=kind, tests=each)
+    if kind == "scatter":
+        return _scattering(fit, name, each)
+    (value, *slope), span = found.common[name], fit.ranges.get(name)
+    one = _judged(fit, free[0], name, value, fit.point.of_common(name), span)
+    why = f"one value for {counted(len(free), 'test')}: {one.why}"
+    if not slope:
+        return replace(one, why=why, kind=kind)
+    b, (error, freedom) = slope[0], fit.point.of_common(f"{name}:b")
+    half, why = covariance.half_width(error, freedom), f"at the rate of the median test; {why}"
+    if math.isfinite(half):
+        one = replace(one, b_stderr=error, b_ci95=(b - half, b + half))
+    b_range = fit.ranges.get(f"{name}:b")
+    return replace(one, why=why, kind=kind, tests=each, b=b, b_range=b_range)
 
-    Also returns the parameters whose slope with rate the tests do not determine, with `open_slope`.
+
+def _scattering(fit: JointFit, name: str, tests: dict[str, ParameterEstimate]) -> ParameterEstimate:
+    spread = fit.spreads.get(name)
+    one = replace(_BLANK, unit=unit_of(name), kind="scatter", tests=tests, state="not determined")
+    if spread is None:
+        why = "too few tests determine it to estimate its common value"
+        return replace(one, value=fit.found.common[name][0], why=why)
+    sign = -1.0 if next(iter(tests.values())).value < 0.0 else 1.0
+    value, *ends = (sign * np.exp(np.minimum([spread.mean, *spread.ci95], LARGEST))).tolist()
+    ci95, limits = (min(ends), max(ends)), (-math.inf, math.inf)
+    state, why = covariance.state(name, value, covariance.wider(ci95, None), abs(value), limits)
+    if state != "not determined":
+        one = replace(one, stderr=abs(value) * spread.stderr, ci95=ci95)
+    why = f"common value of {counted(spread.count, 'test')}: {why}"
+    one = replace(one, scatter_stderr=spread.tau_stderr, scatter_ci95=spread.tau_ci95)
+    return replace(one, value=value, state=state, why=why, scatter=spread.tau)
+
+
+def _judged(
+    fit: JointFit, test: int, name: str, value: float, error: Ends, span: Ends | None
+) -> ParameterEstimate:
+    """Judge a value by the wider of interval and range (`trust.covariance.RULE`).
+
+    `error` contains standard error and degrees of freedom; limits and scale are those of `test`.
     """
-    found, wide = list[Alternative](), dict[str, float]()
-    for name in names:
-        present = fit.links.kind(name)
-        for kind, other in _kinds_of(fit, name, (present, *kinds), [fit.values, *near], wide):
-            bic = other.bic(n_eff)
-            found.append(Alternative(name, kind, kind == present, bic, other.n_vary, other.cost))
-    return tuple(found), wide
+    problem, (stderr, freedom) = fit.found.problems[test], error
+    low, high = limits = fit.point.bests[test].limits(name)
+    size = float(problem.sizes((name,), fit.found.values[test])[0])
+    half = covariance.half_width(stderr, freedom)
+    ends = (value - half, value + half)
+    state, why = covariance.state(name, value, covariance.wider(ends, span), size, limits)
+    one = replace(_BLANK, value=value, unit=unit_of(name), state=state, why=why, range=span)
+    if not half <= covariance.NOTHING * size:
+        return one
+    return replace(one, stderr=stderr, ci95=(max(ends[0], low), min(ends[1], high)))
 
 
-def choose_kinds(
-    problems: Sequence[Problem],
-    links: Links,
-    names: Sequence[str],
-    starts: Sequence[Vectors],
-    n_eff: int,
-    kinds: Sequence[str],
-) -> Links:
-    """Return links in which these parameters have the kinds of least BIC.
-
-    All are shared at first; each round makes the change of one kind that lowers BIC most. A rate
-    law is not tried if the tests do not determine its slope (`open_slope`).
-    """
-    now = fit_linked(problems, links.having(**dict.fromkeys(names, "shared")), starts)
-    while True:
-        trials = [
-            fit
-            for name in names
-            for kind, fit in _kinds_of(now, name, kinds, [now.values, *starts[:1]], {})
-            if kind != now.links.kind(name)
-        ]
-        best = min(trials, key=lambda fit: fit.bic(n_eff), default=now)
-        if best.bic(n_eff) >= now.bic(n_eff):
-            return now.links
-        now = best
-
-
-def _kinds_of(
-    fit: Together, name: str, kinds: Sequence[str], near: Sequence[Vectors], wide: dict[str, float]
-) -> Iterator[tuple[str, Together]]:
-    """Yield fits with each of these kinds of a parameter, and the other parameters as they are.
-
-    Kinds that cannot be simulated are omitted, and rate laws if the slope is not determined, in
-    which case `open_slope` is entered in `wide`.
-    """
-    present = fit.links.kind(name)
-    for kind in sorted(dict.fromkeys(kinds), key=lambda kind: (kind in RATES, kind != present)):
-        if kind in RATES and kind != present and name in wide:
+def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, ParameterEstimate]:
+    """Return a parameter in each test that has it, with the zeros of the test's file."""
+    out, found = dict[str, ParameterEstimate](), fit.found
+    for t, (test, problem) in enumerate(zip(tests, found.problems, strict=True)):
+        if name not in problem.index or problem.is_exact(name):
             continue
-        try:
-            links = fit.links.having(**{name: kind})
-            other = fit if kind == present else fit_linked(fit.problems, links, near)
-        except SimulationError:
-            continue
-        yield kind, other
-        if kind == "own" and any(law in RATES for law in kinds):
-            half = open_slope(other, name)
-            if half > covariance.WEAK:
-                wide[name] = half
-
-
-def open_slope(fit: Together, name: str) -> float:
-    """Return half the 95 % interval of the slope b of a parameter, from its own values.
-
-    The errors of a fit with a rate law do not include the scatter of specimens about the law. With
-    b = 1 a power law is proportional to the rate.
-    """
-    free = [name in problem.free() for problem in fit.problems]
-    values = np.array(fit.value(name))[free]
-    level = float(np.median(values))
-    if fit.links.log_rates is None or values.size < 3 or level == 0.0:
-        return math.inf
-    x = fit.links.log_rates[free]
-    if not np.ptp(x) > 0.0:
-        return math.inf
-    logs = np.log(values / level) if np.all(values / level > 0.0) else values / level
-    return covariance.half_width(float(stats.linregress(x, logs).stderr), values.size - 2)
+        one = replace(_BLANK, value=float(found.values[t][problem.index[name]]), unit=unit_of(name))
+        branch = fit.point.bests[t].unreached.get(name)
+        if not problem.params[name].vary:
+            one = replace(one, vary=False, state="fixed", why="held fixed")
+        elif branch is not None and found.links.kind(name) == "own":
+            why = f"branch {branch} was never reached"
+            one = replace(one, state="not determined", why=why)
+        else:
+            error, span = fit.point.of_test(t, name), fit.own[t].get(name)
+            one = _judged(fit, t, name, one.value, error, span)
+        out[test] = one.counted_from(-problem.measurement.origins.get(name, 0.0))
+    return out

@@ -1,10 +1,11 @@
-"""The result of a joint fit: joint.json, text, page and figure, and a folder per test."""
+"""The result of a joint fit: joint.json, sentences, page and figure, and a folder per test."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,24 +13,35 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foamfit.api import FitResult
+from foamfit.arrays import Array
 from foamfit.codec import plain
+from foamfit.data.calibration import contradictions
+from foamfit.data.measurement import ASKED
+from foamfit.data.zeros import CONTRADICTED
 from foamfit.fitting.links import RATES
+from foamfit.fitting.problem import Problem
+from foamfit.fitting.search import SearchRecord
+from foamfit.fitting.together import Together
 from foamfit.parts import OfLaw, ParameterEstimate
 from foamfit.report import figures
-from foamfit.report.figures import TWO
 from foamfit.report.folder import Result, brief, write_json, write_result, write_text
 from foamfit.report.listing import Row, table_of
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import readable, readable_unit
-from foamfit.report.render import page, words
+from foamfit.report.render import page, sentences, words
 from foamfit.report.studies.parameters import Panel, plot_parameters
 from foamfit.report.tables import MISFITS, formula, frame, parameters_tex, stacked, symbols
-from foamfit.results import Fit, Loop, stamp
+from foamfit.results import Fit, Loop, loop_of, stamp
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
-from foamfit.study.joint_fit import Alternative, JointFit
+from foamfit.study.joint_fit import LARGEST, JointFit, parameters_of
+from foamfit.study.study_file import Study
 from foamfit.text import counted, number
-from foamfit.trust.covariance import RULE
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.budget import unsettled
+from foamfit.trust.checklist import POOR, UNACCEPTABLE, status_of, warnings_of
+from foamfit.trust.conclude import conclude, noise_of
+from foamfit.trust.covariance import RULE, Ends
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,6 +49,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _NOT_IN_FILE = ("loops", "fits", "fit")  # fields that joint.json does not contain
+_OF_A_SEARCH = ("ended", "agree")  # items of the checklist that apply only to a search
+# More than this share of χ², and this multiple of its share of samples, make a test dominant.
+DOMINANT, MORE = 0.5, 2.0
 MOST_ROWS = 60  # of the table of tests on the terminal
 MOST_LOOPS = 48
 SEVERAL_RATES = 1.5  # ratio of rates; those of nominally equal tests differ by a few percent
@@ -57,6 +72,18 @@ class JointTest:
     n_data: int = 0
     data_sha256: str = ""
     values: dict[str, float] = field(default_factory=dict)  #: Of the parameters, SI
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A joint fit with one kind of a parameter, as evidence for this kind."""
+
+    parameter: str
+    kind: str
+    chosen: bool
+    bic: float
+    n_vary: int
+    chi2: float
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -113,6 +140,11 @@ class JointResult(Result, OfLaw):
         every = self.parameters.items()
         return {n: p for n, p in every if n not in NUISANCE and (p.kind != "fixed" or p.value)}
 
+    def of_test(self, test: str) -> dict[str, ParameterEstimate]:
+        """Return the parameters that may differ between tests, in one of them."""
+        every = self.parameters.items()
+        return {name: one.in_test(test) for name, one in every if test in (one.tests or {})}
+
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the loops of all tests, measured and fitted, into axes or a new figure."""
         return draw_loops(self.loops, ax)
@@ -127,10 +159,9 @@ class JointResult(Result, OfLaw):
         columns = {key: {n: getattr(p, key) for n, p in common.items()} for key in more}
         frames = {"": frame(common, **columns)}
         for test in self.tests:
-            own = {n: p for n, p in self.parameters.items() if p.tests and test in p.tests}
-            kinds = {name: p.kind for name, p in own.items()}
-            each = {name: p.in_test(test) for name, p in own.items()}
-            frames[test] = frame(each, kind=kinds, scatter={}, b={})
+            own = self.of_test(test)
+            kinds = {name: self.parameters[name].kind for name in own}
+            frames[test] = frame(own, kind=kinds, scatter={}, b={})
         return stacked(frames, "test")
 
     def __repr__(self) -> str:
@@ -147,7 +178,7 @@ class JointResult(Result, OfLaw):
         more: Any = {"parameters": every, "nuisance": NUISANCE, "between": _between}
         return words("joint", found=self, most=MOST_ROWS, curves=curves, readable=readable, **more)
 
-    def write(self, folder: Path, *, pages: bool = True, width: str = TWO) -> None:
+    def write(self, folder: Path, *, pages: bool = True, width: str = figures.TWO) -> None:
         """Write joint.json, its page, its figure, table.tex, and a result folder per test."""
         write_json(folder / "joint.json", self.to_json_dict())
         shown = self.of_springs
@@ -178,14 +209,8 @@ def _between(one: ParameterEstimate) -> str:
 
 def joint_page(found: JointResult, folder: Path, figure: bytes) -> str:
     """Return the page in a folder, with its figure (SVG)."""
-    varied = {n: p.tests for n, p in found.parameters.items() if p.kind != "fixed" and p.tests}
     rows = [
-        Row(
-            test,
-            misfit=own.misfit,
-            parameters={n: found.parameters[n].in_test(test) for n in varied if test in varied[n]},
-            more=_more(found, own),
-        )
+        Row(test, misfit=own.misfit, parameters=found.of_test(test), more=_more(found, own))
         for test, own in found.tests.items()
     ]
     shown = [(one, readable(name, one), _between(one)) for name, one in found.of_springs.items()]
@@ -199,16 +224,15 @@ def _more(found: JointResult, own: JointTest) -> dict[str, Any]:
     out = {"rate (1/s)": (rate, ""), "share of χ² (%)": (f"{100 * own.chi2_share:.1f}", "")}
     for curve in MISFITS:
         levels = [one.noise[curve]["sigma"] for one in found.tests.values() if curve in one.noise]
-        if curve in own.noise:
+        if (level := own.noise.get(curve)) is not None:
             unit = "m" if curve.startswith("displ") else "Pa"
             factor, unit = readable_unit(max(levels), unit)
-            level = own.noise[curve]
             note = words("noise", level=level, factor=factor)
             out[f"noise {MISFITS[curve]} ({unit})"] = (number(level["sigma"] / factor), note)
     return out
 
 
-def plot_joint(found: JointResult, *, width: str = TWO) -> Figure:
+def plot_joint(found: JointResult, *, width: str = figures.TWO) -> Figure:
     """Draw the loops, and below them the parameters of all tests side by side.
 
     Tests are sorted by rate if rates differ. At most `MOST_LOOPS` loops are drawn.
@@ -221,7 +245,7 @@ def plot_joint(found: JointResult, *, width: str = TWO) -> Figure:
         Panel(
             name,
             formula(own),
-            {names[t]: one.in_test(t) for t in names if one.tests and t in one.tests},
+            {names[t]: one.in_test(t) for t in names if t in (one.tests or {})},
             joint=one,
         )
         for own, (name, one) in zip(symbols(found.varied), found.varied.items(), strict=True)
@@ -244,3 +268,170 @@ def _in_order(found: JointResult) -> dict[str, str]:
     rates = dict(zip(found.tests, found.rates, strict=True))
     tests = sorted(found.tests, key=lambda test: rates[test] or 0.0)
     return {t: t if rates[t] is None else f"{t}, {rates[t]:.2g}/s" for t in tests}
+
+
+def fit_of_test(
+    problem: Problem, values: Array, parameters: dict[str, ParameterEstimate], note: str, seed: int
+) -> Fit:
+    """Return the result of a test in a joint fit; `systematic` is from this test alone."""
+    problem.put(values)
+    alone = conclude(BestPoint(problem, values), SearchRecord(seed, 0, time.perf_counter()))
+    checks = tuple(check for check in alone.checklist if check.key not in _OF_A_SEARCH)
+    verdict: Any = {"status": status_of(checks), "warnings": warnings_of(checks), "budget": None}
+    own = {
+        name: replace(one, systematic=alone.parameters.get(name, one).systematic)
+        for name, one in parameters.items()
+    }
+    notes = (note, *alone.notes)
+    return replace(alone, parameters=own, notes=notes, checklist=checks, **verdict)
+
+
+def result_of(
+    study: Study,
+    tests: Mapping[str, Path],
+    rates: Sequence[float | None],
+    fit: JointFit,
+    alone: Together,
+    slopes: Mapping[str, float],
+    **about: Any,
+) -> JointResult:
+    """Return the result of a joint fit of `tests` (names and files) at these rates (1/s).
+
+    `alone` are the separate fits, and `slopes` those of `joint.evidence`. `about` has further
+    fields of the result.
+    """
+    found, parameters = fit.found, parameters_of(fit, tuple(tests))
+    total = float(np.sum(found.costs))
+    shares = np.divide(found.costs, total) if total else np.full(len(tests), 1.0 / len(tests))
+    others = counted(len(tests) - 1, "other test")
+    note = f"Fitted together with {others} ({study.name}): intervals use all of them."
+    of_tests, fits, loops = dict[str, JointTest](), list[Callable[[], Fit]](), list[Loop]()
+    pairs = zip(tests.items(), rates, fit.point.bests, strict=True)
+    for t, ((name, file), rate, best) in enumerate(pairs):
+        problem, values, curves = best.problem, found.values[t], best.simulated.curves
+        measurement, objective = problem.measurement, problem.objective
+        estimates = _estimates(problem, values, name, parameters)
+        of_tests[name] = JointTest(
+            file=str(file),
+            drive=objective.drive,
+            rate=rate,
+            misfit=found.misfits[t],
+            chi2_share=float(shares[t]),
+            noise=noise_of(best, fit.point.errors[t]),
+            n_data=objective.n_data,
+            data_sha256=measurement.data_sha256,
+            values={one: estimate.value for one, estimate in estimates.items()},
+        )
+        fits.append(partial(fit_of_test, problem, values, estimates, note, study.seed))
+        loop = loop_of(measurement, curves.get("stress_strain"), curves.get("stress_time"))
+        loops += [] if loop is None else [loop._replace(name=name)]
+    drives = {one.drive for one in of_tests.values()}
+    result = JointResult(
+        **{name: getattr(study, name) for name in ("name", "model", "relaxation", "seed")},
+        drive=drives.pop() if len(drives) == 1 else None,
+        tests=of_tests,
+        parameters=parameters,
+        covariance={"names": fit.point.names, "matrix": _common_covariance(fit)},
+        specimens={"names": fit.correlation[0], "correlation": fit.correlation[1]},
+        statistics=_statistics(fit, alone),
+        loops=tuple(loops),
+        fits=tuple(fits),
+        fit=fit,
+        **about,
+    )
+    return _with_words(result, fit, alone, slopes)
+
+
+def _estimates(
+    problem: Problem, values: Array, test: str, parameters: Mapping[str, ParameterEstimate]
+) -> dict[str, ParameterEstimate]:
+    """Return the parameters of one test, as in its fit.json."""
+    out = dict[str, ParameterEstimate]()
+    for name, value in zip(problem.names, (values + problem.origins).tolist(), strict=True):
+        if problem.is_exact(name):
+            continue
+        one, param = parameters[name], problem.params[name]
+        if param.vary:
+            at = one.in_test(test)
+            out[name] = replace(at, value=value, ci95_method=at.ci95 and "local covariance")
+        else:
+            why = "held fixed" if param.expr is None else f"tied by {param.expr}"
+            out[name] = ParameterEstimate(value, None, None, one.unit, False, "fixed", why)
+    return out
+
+
+def _statistics(fit: JointFit, alone: Together) -> dict[str, float | int]:
+    found = fit.found
+    return {
+        "n_tests": len(found.problems),
+        "n_data": found.n_data,
+        "n_vary": found.n_vary,
+        "chisqr": found.cost,
+        "redchi": found.cost / max(found.n_data - found.n_vary, 1),
+        "n_effective": fit.point.uncertainty.covariance.effective,
+        "n_eff": alone.n_eff,
+        "bic": found.bic(alone.n_eff),
+        "bic_alone": alone.bic(alone.n_eff),
+        "n_vary_alone": alone.n_vary,
+        "chisqr_alone": alone.cost,
+    }
+
+
+def _common_covariance(fit: JointFit) -> Array:
+    """Return the covariance of common values and slopes, SI; see `JointResult`."""
+    point, count = fit.point, len(fit.point.names)
+    scales = np.ones(count)
+    for i, name in enumerate(point.names):
+        if fit.found.links.kind(name) == "scatter":
+            spread, error = fit.spreads.get(name), point.of_common(name)[0]
+            scales[i] = math.exp(min(spread.mean, LARGEST)) if spread else fit.found.common[name][0]
+            scales[i] *= spread.stderr / error if spread and error > 0.0 else 1.0
+    matrix = point.uncertainty.covariance.matrix[:count, :count]
+    return np.asarray(matrix * np.outer(scales, scales))
+
+
+def _with_words(
+    result: JointResult, fit: JointFit, alone: Together, open_slopes: Mapping[str, float]
+) -> JointResult:
+    """Return a joint fit with its status, warnings and sentences."""
+    lost, large, wrong, missed = dict[str, None](), list[Any](), list[Any](), list[float]()
+    doubts = dict[str, list[str]]()  # tests by their notes about probable errors in the input
+    every = zip(result.tests.items(), fit.point.bests, fit.point.errors, strict=True)
+    for (test, one), best, errors in every:
+        objective = best.problem.objective
+        pairs = zip(objective.counted, errors, strict=True)
+        shares = [error.law / objective.span(curve) for curve, error in pairs if error.found]
+        missed += [max(shares)] if shares else []
+        measurement = best.problem.measurement
+        for note in measurement.notes:
+            if note.startswith(ASKED) and CONTRADICTED not in note:
+                doubts.setdefault(note.removeprefix(ASKED).strip(), []).append(test)
+        found = unsettled(best, contradictions(measurement))
+        wrong += [(test, each, objective.drive) for each in found]
+        for curve in objective.counted:
+            misfit, measured = one.misfit[curve], objective.measured[curve]
+            if misfit is None or not misfit <= UNACCEPTABLE * np.std(measured) / np.ptp(measured):
+                lost[test] = None
+            elif misfit > POOR:
+                large.append((test, curve, misfit))
+    rates = [rate for rate in result.rates if rate is not None]
+    first, top = max(result.tests.items(), key=lambda pair: pair[1].chi2_share)
+    slopes = [(name, result.parameters[name].kind, half) for name, half in open_slopes.items()]
+    told: dict[str, Any] = {"result": result, "laws": RATES, "slopes": slopes, "lost": list(lost)}
+    told |= {"large": large, "wrong": wrong, "doubts": doubts, "missed": missed}
+    told |= {"rates": f"{min(rates):.3g} to {max(rates):.3g} 1/s" if rates else ""}
+    told |= {"top": (first, top), "dominant": max(DOMINANT, MORE * top.n_data / fit.found.n_data)}
+    told |= {"together": _span_of(fit.found.misfits), "alone": _span_of(alone.misfits)}
+    told |= {"n_vary": fit.found.n_vary}
+    warnings = sentences("joint_warnings", **told)
+    status = "failed" if lost else "warnings" if warnings else "ok"
+    said = sentences("joint_sentences", **told)
+    return replace(result, status=status, warnings=warnings, sentences=said)
+
+
+def _span_of(found: Sequence[dict[str, float | None]]) -> Ends | None:
+    """Return smallest and largest misfit of some fits, of the loop or else of a time curve."""
+    names = ("stress_strain", "stress_time", "displacement_time")
+    each = (next((fit[n] for n in names if fit.get(n) is not None), None) for fit in found)
+    misfits = [misfit for misfit in each if misfit is not None]
+    return (min(misfits), max(misfits)) if misfits else None

@@ -30,24 +30,13 @@ from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.one_model import Progress
 from foamfit.parts import rung_name
-from foamfit.report.studies.plan import RISKY, Expected, Outcome, Plan
+from foamfit.report.studies.plan import RISKY, Expected, Outcome, Plan, Quantity
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.parameters import NUISANCE
 from foamfit.springs.published import published
-from foamfit.study.gain import (
-    Known,
-    Seen,
-    Target,
-    covariance,
-    expected,
-    information,
-    look,
-    no_worse,
-    problem_for,
-    rows_of,
-    without_nuisance,
-)
+from foamfit.study import gain
+from foamfit.study.gain import Known, Seen
 from foamfit.study.joint_result import JointResult
 from foamfit.study.saved import load, with_record
 from foamfit.text import counted
@@ -75,6 +64,11 @@ class Test:
     values: Array
     fit: FitResult | None = None
     study: str = ""  # name of the joint fit that it belongs to
+
+    def with_springs(self, drawn: Array) -> Array:
+        """Return its parameters with drawn springs."""
+        count = len(self.problem.model.names)
+        return np.append(drawn[:count], self.values[count:])
 
 
 @single_threaded
@@ -119,18 +113,18 @@ def plan(
     progress(0.0, "drawing what the tests leave open")
     known = known_of(tests, rng, DRAWS)
     others = {name: known_of([one], rng, 0) for name, one in rivals.items()}
-    target = None if quantity is None else Target.of(quantity, known, limits)
+    target = None if quantity is None else gain.Target.of(quantity, known, limits)
     seen = list[Seen]()
     for i, one in enumerate(asked):
         progress(0.05 + 0.85 * i / len(asked), f"{counted(len(asked), 'candidate')}, {i} done")
-        seen.append(look(known, one, limits, others))
+        seen.append(gain.look(known, one, limits, others))
 
-    contradicted = known.missed > 0.0 and _contradicted(tests)
+    contradicted = known.missed > 0.0 and any(x.fit and x.fit.contradictions for x in tests)
 
     def outcome(one: Candidate, *more: Seen) -> Outcome:
         risk = np.any([each.broken for each in more], axis=0)
         error = None if target is None else target.error(known, more)
-        found = no_worse(expected(known, more), now)
+        found = gain.no_worse(gain.expected(known, more), now)
         if contradicted and one.drive == "impact":  # as in a fit, where the law errs as well
             found = {name: x.capped() for name, x in found.items()}
         return Outcome(one, float(np.mean(risk)), found, more[0].force, error, more[0].apart)
@@ -158,7 +152,9 @@ def plan(
         pair=pair and (outcome(asked[pair[0]], *(seen[i] for i in pair)), asked[pair[1]]),
         never=never,
         closing={mass: _closing(known, mass, limits) for mass in limits.masses},
-        quantity=None if target is None else target.shown(known),
+        quantity=None
+        if target is None
+        else Quantity(target.text, target.unit, target.middle, target.error(known, [])),
         rivals=tuple(others),
         missed=known.missed > 0.0,
         contradicted=contradicted,
@@ -194,11 +190,6 @@ def _as_fitted(tests: Sequence[Test]) -> dict[str, Any]:
     held = {n: one.value for n, one in params.items() if not one.vary and one.expr is None}
     held = {n: x for n, x in held.items() if usual[n].vary or usual[n].value != x}
     return {"drives": frozenset(drives), "held": held}
-
-
-def _contradicted(tests: Sequence[Test]) -> bool:
-    """Return whether a test at hand contradicts its own record."""
-    return any(one.fit is not None and one.fit.contradictions for one in tests)
 
 
 def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
@@ -260,8 +251,8 @@ def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Kno
     missed, share, reached, roots = _of_fits(tests, names)
 
     def said(t: int, values: Array) -> tuple[Array, Array]:
-        rows = rows_of(tests[t].problem, values, names, sizes)
-        return information(without_nuisance(rows, k), roots[t])
+        rows = gain.rows_of(tests[t].problem, values, names, sizes)
+        return gain.information(gain.without_nuisance(rows, k), roots[t])
 
     found_by = [said(t, one.values) for t, one in enumerate(tests)]
     breads, meats = (np.array(each) for each in zip(*found_by, strict=True))
@@ -273,12 +264,11 @@ def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Kno
     known = replace(known, stretch=_stretch(known, tests))
     if not draws:
         return known
-    drawn, springs = _draws(known, tests, rng, draws), len(first.model.names)
+    drawn = _draws(known, tests, rng, draws)
     bread, meat = np.repeat(known.bread, draws, axis=0), np.repeat(known.meat, draws, axis=0)
     for i, one in enumerate(drawn):
         with suppress(SimulationError):  # a coarser simulation had followed the test
-            own = [said(t, np.append(one[:springs], test.values[springs:]))
-                   for t, test in enumerate(tests)]  # fmt: skip
+            own = [said(t, test.with_springs(one)) for t, test in enumerate(tests)]
             bread[i], meat[i] = np.sum(own, axis=0)
     return replace(known, draws=drawn, bread=bread, meat=meat)
 
@@ -320,12 +310,11 @@ def _mean_of(tests: Sequence[Test], names: Sequence[str], sizes: Array, breads: 
 
 def _stretch(known: Known, tests: Sequence[Test]) -> Array:
     """Return the widest range of each parameter in the fits over that to first order, (k,)."""
-    law = np.sqrt(np.maximum(np.diagonal(covariance(known, [])[1][0]), 0.0))
+    law = np.sqrt(np.maximum(np.diagonal(gain.covariance(known, [])[1][0]), 0.0))
     out = np.ones(law.size)
-    for one in tests:
+    for fit in (one.fit for one in tests if one.fit is not None):
         for i, name in enumerate(known.names):
-            found = None if one.fit is None else one.fit.parameters[name].range
-            if found is not None and law[i] > 0.0:
+            if (found := fit.parameters[name].range) is not None and law[i] > 0.0:
                 half = 0.5 * (found[1] - found[0]) / known.sizes[i]
                 out[i] = max(out[i], half / law[i])
     return out
@@ -354,8 +343,8 @@ def _draws(known: Known, tests: Sequence[Test], rng: np.random.Generator, count:
     thin, n_springs = [one.problem.thinned().objective for one in tests], len(problem.model.names)
 
     def cost(values: Array) -> float:
-        own = [np.append(values[:n_springs], one.values[n_springs:]) for one in tests]
-        return sum(float(np.sum(o.residual(v) ** 2)) for o, v in zip(thin, own, strict=True))
+        own = zip(thin, (one.with_springs(values) for one in tests), strict=True)
+        return sum(float(np.sum(objective.residual(v) ** 2)) for objective, v in own)
 
     noise = float(np.max(np.diag(known.meat[0]) / np.maximum(np.diag(known.bread[0]), 1e-300)))
     most = cost(known.values) + allowed + max(noise, 1.0) * float(stats.chi2.ppf(0.99, k))
@@ -391,13 +380,14 @@ def _with_open(
 
 def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
     """Return what is known now; of a single test what its result says."""
-    out, fit = expected(known, []), tests[0].fit
-    for i, name in enumerate(known.names if fit is not None and len(tests) == 1 else ()):
-        assert fit is not None
+    out, fit = gain.expected(known, []), tests[0].fit
+    if fit is None or len(tests) > 1:
+        return out
+    for name, size in zip(known.names, known.sizes.tolist(), strict=True):
         one = fit.parameters[name]
         width = math.nan if one.ci95 is None else one.ci95[1] - one.ci95[0]
-        share, chance = 0.5 * width / known.sizes[i], float(one.state == "determined")
-        out[name] = Expected(width, one.state, (width, width), chance, float(share))
+        share, chance = 0.5 * width / size, float(one.state == "determined")
+        out[name] = Expected(width, one.state, (width, width), chance, share)
     return out
 
 
@@ -440,7 +430,7 @@ def _pair(
     first = sorted(safe, key=lambda i: -outcomes[i].number)[:PAIRED]
 
     def number(pair: tuple[int, int]) -> float:
-        found = expected(known, [seen[i] for i in pair])
+        found = gain.expected(known, [seen[i] for i in pair])
         return sum(one.probability for one in found.values())
 
     return max(combinations(first, 2), key=number, default=None)
@@ -450,12 +440,13 @@ def _beyond(known: Known, left: Sequence[str], rig: Rig, *, impacts: bool) -> di
     """Return, for parameters that no test of the rig determines, what other rig would."""
     problem, out = known.problem, dict.fromkeys(left, "")
     test, springs = problem.measurement, len(problem.model.kinds)
-    few = known.first(DRAWS // 4)
+    fewer = {n: getattr(known, n)[: DRAWS // 4] for n in ("draws", "bread", "meat")}
+    few = replace(known, **fewer)
     for what, other in beyond(rig, springs) if left else ():
         made = [one for one in candidates(other, test, springs) if not one.repeat]
         made = [one for one in made if impacts or one.drive != "impact"]
         for one in made[:: max(len(made) // 12, 1)]:
-            found = expected(few, [look(few, one, other)])
+            found = gain.expected(few, [gain.look(few, one, other)])
             new = [name for name in left if found[name].state == "determined" and not out[name]]
             out |= dict.fromkeys(new, what)
     return out
@@ -469,7 +460,7 @@ def _closing(known: Known, mass: float, rig: Rig) -> tuple[float, float]:
     """
     top = 2.0 * rig.velocity[1]
     speeds = np.geomspace(*rig.velocity, 4).tolist()
-    made = [problem_for(known, Candidate("impact", mass, speed), rig) for speed in speeds]
+    made = [gain.problem_for(known, Candidate("impact", mass, speed), rig) for speed in speeds]
     problem = max(made, key=lambda one: float(one.objective.time[-1]))  # of the longest contact
     at, needed = problem.index[VELOCITY], list[float]()
 

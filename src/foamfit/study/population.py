@@ -185,9 +185,8 @@ class Population:
         if not names:
             return _Own((), np.empty(0), np.empty(0), np.empty((0, 0)), np.empty(0))
         if len({tuple(self._parameters[name].tests or ()) for name in names}) > 1:
-            raise InputError(
-                f"{self.source.where}: all own parameters must have values for the same tests"
-            )
+            why = f"{self.source.where}: all own parameters must have values for the same tests"
+            raise InputError(why)
         values = np.array([self._tests(name) for name in names]).T
         logs = [self._in_logarithms(name) for name in names]
         values[:, logs] = np.log(values[:, logs])

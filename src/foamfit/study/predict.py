@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,7 @@ from foamfit.data.cycles import cycles_of, loading_rate
 from foamfit.data.measurement import ASKED, Measurement
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError, check_whole
-from foamfit.fitting.curves import (
-    check_drive,
-    check_time_shift,
-    choose_drive,
-    driving_motion,
-    is_exact,
-)
+from foamfit.fitting import curves
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.scenes import channel_of
@@ -113,48 +108,32 @@ def predict(
         point, aligned = _aligned(aligning, springs, population.scattering)
         simulated = objective.simulate(point, everything=True)
     except SimulationError as error:
-        raise SimulationError(
-            f"{measurement.name} cannot be predicted from {source.where}: {error}"
-        ) from None
+        why = f"{measurement.name} cannot be predicted from {source.where}: {error}"
+        raise SimulationError(why) from None
     values, drawn, redrawn = list[Array](), list[dict[str, Array]](), 0
     if population.scattering:
         values, drawn, redrawn = _draw(population, problem, point, draws, seed)
     halves = {"parameters": _by_parameters(population, aligning, point, tuple(aligned))}
     halves |= {"motion": _by_motion(problem, point)}
-    curves = dict[str, PredictedCurve]()
+    bands = dict[str, PredictedCurve]()
     for name in objective.counted:
         parts = {part: of_curves[name] for part, of_curves in halves.items() if name in of_curves}
-        curves[name] = _curve(problem, name, simulated.curves[name], drawn, source, parts)
+        bands[name] = _curve(problem, name, simulated.curves[name], drawn, source, parts)
     changing, count = population.scattering, population.fewest
-    later = measurement.last_cycle or measurement.cycle
-    warnings = render.sentences(
-        "predicted_warnings",
-        source=source,
-        test=measurement.name,
-        rate=rate,
-        outside=outside,
-        drive=objective.drive,
-        nearest=not np.array_equal(springs, population.point),
-        few=count if changing and count < max(3, min(len(changing), FEW_TESTS)) else None,
-        scattering=changing,
-        held=population.held,
-        untold=[c.channel for c in curves.values() if c.channel not in source.misses],
-        missed=[curve for curve in curves.values() if curve.inside < LEAST_INSIDE],
-        doubts=_doubts(problem),
-        again=source.sha256 == measurement.data_sha256 and later > 1,
-        drawn=len(values) if changing else draws,
-        draws=draws,
-    )
-    sentences = render.sentences(
-        "predicted_sentences",
-        curves=curves.values(),
-        scattering=changing,
-        trends=population.trends,
-        aligned=[
-            f"{name.replace('_', ' ')} {engineering(value, unit_of(name)).replace('-', '−')}"
-            for name, value in aligned.items()
-        ],
-    )
+    later, few = measurement.last_cycle or measurement.cycle, max(3, min(len(changing), FEW_TESTS))
+    told: dict[str, Any] = {"source": source, "test": measurement.name, "rate": rate}
+    told |= {"outside": outside, "drive": objective.drive, "doubts": _doubts(problem)}
+    told |= {"nearest": not np.array_equal(springs, population.point), "held": population.held}
+    told |= {"scattering": changing, "few": count if changing and count < few else None}
+    told |= {"drawn": len(values) if changing else draws, "draws": draws}
+    told |= {"again": source.sha256 == measurement.data_sha256 and later > 1}
+    told |= {"curves": bands.values(), "trends": population.trends}
+    told["untold"] = [one.channel for one in bands.values() if one.channel not in source.misses]
+    told["missed"] = [one for one in bands.values() if one.inside < LEAST_INSIDE]
+    told["aligned"] = [
+        f"{name.replace('_', ' ')} {engineering(value, unit_of(name)).replace('-', '−')}"
+        for name, value in aligned.items()
+    ]
     return Prediction(
         source=source.name,
         joint=source.joint,
@@ -163,7 +142,7 @@ def predict(
         relaxation=source.model.relaxation,
         drive=objective.drive,
         seed=int(seed),
-        curves=curves,
+        curves=bands,
         misfit=objective.misfit(simulated),
         parameters=_parameters(population, springs, values),
         rate=rate,
@@ -172,8 +151,8 @@ def predict(
         draws=len(values),
         redrawn=redrawn,
         held=population.held,
-        sentences=sentences,
-        warnings=warnings,
+        sentences=render.sentences("predicted_sentences", **told),
+        warnings=render.sentences("predicted_warnings", **told),
         aligned=aligned,
     )
 
@@ -203,21 +182,19 @@ def _doubts(problem: Problem) -> list[str]:
 
 def _problem(source: Source, measurement: Measurement, drive: str | None) -> Problem:
     """Return the problem of the test with the law of the result."""
-    chosen = drive or source.drive or choose_drive(measurement)
+    chosen = drive or source.drive or curves.choose_drive(measurement)
     try:
-        check_drive(measurement, chosen)
+        curves.check_drive(measurement, chosen)
     except InputError as error:
         if drive is not None:
             raise
         raise InputError(
             f"{error}; {source.name} was fitted with this drive, choose another by --drive (drive=)"
         ) from None
-    inside, shift = source.interior_mass and chosen == "impact", source.time_shift
-    if shift:
-        try:
-            check_time_shift(measurement, chosen)
-        except InputError:  # this record cannot have the time shift of the fitted one
-            shift = False
+    inside, shift = source.interior_mass and chosen == "impact", False
+    with suppress(InputError):  # if this record cannot have the time shift of the fitted one
+        curves.check_time_shift(measurement, chosen)
+        shift = source.time_shift
     law, terms = source.model.name, source.model.relaxation
     problem = make_problem(
         measurement, law, chosen, None, None, inside, time_shift=shift, relaxation=terms
@@ -225,10 +202,10 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
     objective, same = problem.objective, source.sha256 == measurement.data_sha256
     if not same or source.smoothed is None or chosen != "displacement":
         return problem
-    if is_exact(objective.measurement):
+    if curves.is_exact(objective.measurement):
         return problem  # nothing is smoothed, but turns between samples are found
     # The fitted record, possibly with other cycles: smooth the motion only if the fit did.
-    motion = driving_motion(objective.measurement, objective.time, always=source.smoothed)
+    motion = curves.driving_motion(objective.measurement, objective.time, always=source.smoothed)
     followed = (motion if source.smoothed else None,)
     return replace(problem, objective=replace(objective, followed=followed))
 
@@ -264,10 +241,7 @@ def _point(population: Population, problem: Problem) -> Array:
 def _aligned(
     problem: Problem, springs: Array, scattering: tuple[str, ...]
 ) -> tuple[Array, dict[str, float]]:
-    """Fit the nuisance parameters of the record.
-
-    Returns all parameters, and the fitted ones with the zeros of the record's file.
-    """
+    """Return all parameters, and the fitted nuisance parameters with the zeros of the file."""
     # Scattering parameters are fitted too and then discarded: if they were fixed, a stiffer
     # specimen would be mistaken for an earlier contact.
     params = problem.params.copy()
@@ -295,14 +269,11 @@ def _aligned(
 def _draw(
     population: Population, problem: Problem, point: Array, draws: int, seed: int
 ) -> tuple[list[Array], list[dict[str, Array]], int]:
-    """Draw and simulate specimens.
-
-    Returns their parameters and curves, and the number of additional draws that failed.
-    """
+    """Return parameters and curves of drawn specimens, and the number of draws that failed."""
     # Parameters outside the limits of a fit are clipped, as in a fit. Drawing them again would
     # distort the distribution of the other parameters.
     objective, specimens, tried = problem.objective, population.draws(seed), 0
-    values, curves = list[Array](), list[dict[str, Array]]()
+    values, drawn = list[Array](), list[dict[str, Array]]()
     limits = _limits(population, point[: len(population.source.parameters)])
     while len(values) < draws and tried < TRIES * draws:
         tried += 1
@@ -312,13 +283,13 @@ def _draw(
         except SimulationError:
             continue
         values.append(one)
-        curves.append({name: simulated.curves[name] for name in objective.counted})
+        drawn.append({name: simulated.curves[name] for name in objective.counted})
     if len(values) < FEWEST:
         raise SimulationError(
             f"{population.source.where}: only {len(values)} of {tried} specimens drawn from its "
             "scatter can be simulated; fix or share the parameters that are not determined"
         )
-    return values, curves, tried - len(values)
+    return values, drawn, tried - len(values)
 
 
 def _by_parameters(

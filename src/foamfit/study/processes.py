@@ -26,7 +26,7 @@ from typing import Any
 from foamfit.terminal import without_ctrl_c
 
 # Modules that are imported by fits and by their pages.
-FITS = ("foamfit.study.batch_work", "foamfit.data.csv_file", "pandas", "pint")
+FITS = ("foamfit.study.batch", "foamfit.data.csv_file", "pandas", "pint")
 PAGES = ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf", "jinja2")
 # One thread per process, as there is one process per core.
 ONE_THREAD = {

@@ -52,7 +52,6 @@ def load(folder: str | Path) -> FitResult | JointResult | CycleFits | pd.DataFra
 
 
 def _fit(folder: Path) -> FitResult:
-    """Read fit.json and curves.csv."""
     content = load_result(folder)
     if not isinstance(content.get("load"), Mapping):
         raise InputError(
@@ -86,7 +85,6 @@ def _columns(path: Path, samples: object) -> dict[str, Array]:
 
 
 def _joint(folder: Path) -> JointResult:
-    """Read joint.json and the folders of its tests."""
     content = load_result(folder / "joint.json")
     with reading(f"{folder / 'joint.json'}"):
         given = content | {"model": Model.of_result(content).name}
@@ -98,7 +96,6 @@ def _joint(folder: Path) -> JointResult:
 
 
 def _cycles(folder: Path) -> CycleFits:
-    """Read cycles.json and the folders of its cycles."""
     content = load_result(folder / "cycles.json")
     with reading(f"{folder / 'cycles.json'}"):
         made: CycleFits = build(CycleFits, content | {"results": {}}, {})

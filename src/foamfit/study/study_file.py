@@ -11,18 +11,8 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from foamfit.data.toml_file import (
-    COUNT,
-    FLAG,
-    RANGE,
-    Check,
-    Rule,
-    anything,
-    checked,
-    load_toml,
-    motion_file,
-    table_of,
-)
+from foamfit.data import toml_file
+from foamfit.data.toml_file import Check, Rule, checked, motion_file, table_of
 from foamfit.errors import InputError, naming
 from foamfit.fitting.links import KINDS
 from foamfit.options import FREED, OF_FIT
@@ -48,11 +38,11 @@ _KEYS: dict[str, Check] = {
     "tests": _PATTERNS,
     "model": _text('model = "microscale"'),
     "specimen": _text('specimen = "foam.toml"'),
-    "cycle": COUNT,
-    "cycles": RANGE,
+    "cycle": toml_file.COUNT,
+    "cycles": toml_file.RANGE,
     **{n: Rule(OF_FIT[n].admits, OF_FIT[n].right) for n in ("drive", "seed", "starts")},
-    **dict.fromkeys(FREED, FLAG),
-    **dict.fromkeys(("relaxation", "specimens", "parameters"), anything),
+    **dict.fromkeys(FREED, toml_file.FLAG),
+    **dict.fromkeys(("relaxation", "specimens", "parameters"), toml_file.anything),
 }
 
 
@@ -81,7 +71,7 @@ class Study:
 def read_study(path: str | Path) -> Study:
     """Read and check a study file; InputError names the file and the wrong or missing key."""
     path = Path(path)
-    content = load_toml(path, "a study is a TOML with tests, model and [parameters]")
+    content = toml_file.load_toml(path, "a study is a TOML with tests, model and [parameters]")
     found = checked(content, _KEYS, f"{path}:", ["tests", "model"])
     with naming(path):
         if {"cycle", "cycles"} <= content.keys():
@@ -110,9 +100,8 @@ def _tests(path: Path, content: Mapping[str, Any]) -> tuple[tuple[str, Path, Pat
     except InputError as error:
         raise InputError(f"tests: {error}") from None
     if len(found) < 2:
-        raise InputError(
-            f"tests names {'one test' if found else 'none'}; a joint fit needs at least two"
-        )
+        why = f"tests names {'one test' if found else 'none'}; a joint fit needs at least two"
+        raise InputError(why)
     toml, specimens = _text('"a.toml"'), table_of(content, "specimens")
     own = checked(specimens, dict.fromkeys([name for name, _ in found], toml), "[specimens]")
     pairs = ((test, own.get(test[0], content.get("specimen"))) for test in found)
@@ -141,9 +130,8 @@ def _parameters(table: Mapping[str, Any], model: Model) -> tuple[dict[str, str],
             held[name] = float(value)
         else:
             wanted = ", ".join((*KINDS, AUTO))
-            raise InputError(
-                f"{where} = {value!r} must be one of {wanted}, or a number (SI) to fix it"
-            )
+            why = f"{where} = {value!r} must be one of {wanted}, or a number (SI) to fix it"
+            raise InputError(why)
     return kinds, held
 
 
