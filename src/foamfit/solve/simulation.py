@@ -12,21 +12,8 @@ from numpy.typing import ArrayLike
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.solve.plan import (
-    AGGREGATE,
-    CLOSED_FORM,
-    EXPLICIT_STEPS,
-    FIRST_ORDER,
-    LEAST_TOL,
-    MOST_WORK,
-    NO_DIRECTIONS,
-    RADAU,
-    SECOND_ORDER,
-    Directions,
-    Motion,
-    Plan,
-    plan,
-)
+from foamfit.solve import plan as plans
+from foamfit.solve.plan import NO_DIRECTIONS, Directions, Motion, Plan, plan
 from foamfit.solve.scene import MOTION, Slopes, difference
 from foamfit.springs.chain import Chain, ChainArrays, Drive, check_scene
 from foamfit.springs.compiled.contract import BY_STRESS
@@ -105,7 +92,7 @@ def _verified(
     inside = groups > 2
     if groups == 2:  # the base stress depends on the velocity of the mass above
         inside = bool((rows[: scene.ends[0], 0] > 0.0).any())
-    long = inside or motion.method == RADAU or _is_long(scene, motion, FEW_STEPS)
+    long = inside or motion.method == plans.RADAU or _is_long(scene, motion, FEW_STEPS)
     if scene.speed > 0.0 and not long and not _hard(scene, arrays):
         return motion
 
@@ -116,7 +103,7 @@ def _verified(
     if lost > 0.7 * rtol:  # the comparison below leaves 0.3
         # An explicit step covers about 3 radians and costs 1 % of an implicit step.
         rates = scene.fastest_rates(rows, heights, scene.drag)
-        explicit = max(rates) / 3.0 <= MOST_WORK / len(heights)
+        explicit = max(rates) / 3.0 <= plans.MOST_WORK / len(heights)
         motion, scene = _resolve_vibrations(scene, motion, rtol, explicit, run)
     distance = _distance_at_peak(scene, arrays, motion, rtol)
     if 0.3 * rtol * distance < 1e-15:
@@ -127,10 +114,10 @@ def _verified(
     forced = 0 if scene.speed > 0.0 else scene.time.size
     long = _is_long(scene, motion, FEW_STEPS + 2 * forced) or inside
     long = long or min(distance, _distance_by_stress(scene, arrays, motion)) < CLOSE
-    long = (long and scene.solver == SECOND_ORDER) or sharp
-    if not (long or motion.method == RADAU) or rtol < 1e-12:  # a finer run would only round
+    long = (long and scene.solver == plans.SECOND_ORDER) or sharp
+    if not (long or motion.method == plans.RADAU) or rtol < 1e-12:  # a finer run would only round
         return motion
-    if motion.method == EXPLICIT_STEPS and not sharp:
+    if motion.method == plans.EXPLICIT_STEPS and not sharp:
         with suppress(SimulationError):
             if _agrees_with_longer_steps(scene, arrays, motion, rtol):
                 return motion
@@ -169,7 +156,7 @@ def _compared(
         if rtol * factor < 1e-14:
             break
         try:
-            finer = run(scene._replace(least=LEAST_TOL), rtol * factor)
+            finer = run(scene._replace(least=plans.LEAST_TOL), rtol * factor)
         except SimulationError:
             if scene.implicit is False:  # the last resort, see `_resolve_vibrations`
                 raise SimulationError(_UNRESOLVED.format(size=lost)) from None
@@ -195,7 +182,7 @@ def _may_snap_wrongly(scene: Plan) -> bool:
     In a snap of a narrow spread the smallest error of a strain may enter the wrong branch.
     """
     laws = scene.laws.made
-    if scene.solver != FIRST_ORDER or len(laws) == len(scene.ends):
+    if scene.solver != plans.FIRST_ORDER or len(laws) == len(scene.ends):
         return False
     return any(one.kind == BY_STRESS for one in laws)
 
@@ -223,8 +210,8 @@ def _resolve_vibrations(
 def _is_long(scene: Plan, motion: Motion, few: int) -> bool:
     """Whether a motion took many steps or switches (the steps of an aggregate are switches)."""
     bounces = len(scene.ends) > 1 or scene.speed == 0.0
-    vibrates = bounces and scene.solver == SECOND_ORDER and len(motion.switches) > FEW_SWITCHES
-    return (motion.steps > few or vibrates) and motion.method != AGGREGATE
+    many = scene.solver == plans.SECOND_ORDER and len(motion.switches) > FEW_SWITCHES
+    return (motion.steps > few or (bounces and many)) and motion.method != plans.AGGREGATE
 
 
 def _hard(scene: Plan, arrays: ChainArrays) -> bool:
@@ -264,7 +251,7 @@ def _distance_at_peak(scene: Plan, arrays: ChainArrays, motion: Motion, rtol: fl
     """
     rows, heights = arrays.rows, arrays.heights
     distance = _distance(scene, arrays, motion.displacement)
-    if scene.solver == CLOSED_FORM or scene.speed == 0.0 or not _hard(scene, arrays):
+    if scene.solver == plans.CLOSED_FORM or scene.speed == 0.0 or not _hard(scene, arrays):
         return distance
     low, high = 0.0, float(scene.time[-1])
     for _ in range(12):
