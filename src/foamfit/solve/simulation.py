@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -219,15 +219,19 @@ def _hard(scene: Plan, arrays: ChainArrays) -> bool:
     return bool(0.5 * scene.mass.item(-1) * scene.speed**2 >= 6.0 * arrays.steep)
 
 
-def _distance(scene: Plan, arrays: ChainArrays, displacement: Array) -> float:
-    """Return the least distance, in strain, of any spring from 1 + ε_*; at most 1."""
-    strain = np.diff(displacement, axis=0, prepend=0.0).max(axis=1) / arrays.heights
-    least = 1.0
+def _poles(scene: Plan, arrays: ChainArrays) -> Iterator[tuple[int, float, float]]:
+    """Yield number, ε_* and k_c of each spring whose strain stays below 1 + ε_*."""
+    at = 1 + 2 * scene.terms
     for i, one in enumerate(scene.laws.made):
         if one.pole >= 0:
-            star = float(arrays.rows[i, 1 + 2 * scene.terms + one.pole])
-            least = min(least, 1.0 - (float(strain[i]) - max(star, 0.0)))
-    return least
+            yield i, arrays.rows.item(i, at + one.pole), arrays.rows.item(i, at + one.slopes[1])
+
+
+def _distance(scene: Plan, arrays: ChainArrays, displacement: Array) -> float:
+    """Return the least distance, in strain, of any spring from 1 + ε_*; at most 1."""
+    strain = (np.diff(displacement, axis=0, prepend=0.0).max(axis=1) / arrays.heights).tolist()
+    left = [1.0 - (strain[i] - max(star, 0.0)) for i, star, _ in _poles(scene, arrays)]
+    return float(min([1.0, *left]))
 
 
 def _distance_by_stress(scene: Plan, arrays: ChainArrays, motion: Motion) -> float:
@@ -236,12 +240,7 @@ def _distance_by_stress(scene: Plan, arrays: ChainArrays, motion: Motion) -> flo
     It is that at which branch c has the largest stress of any spring. A mass may rebound from the
     end of a branch between two samples.
     """
-    least, at = 1.0, 1 + 2 * scene.terms
-    for i, one in enumerate(scene.laws.made):
-        if one.pole >= 0:
-            kc = float(arrays.rows[i, at + one.slopes[1]])
-            least = min(least, kc / (kc + motion.strongest))
-    return least
+    return min([1.0, *(kc / (kc + motion.strongest) for _, _, kc in _poles(scene, arrays))])
 
 
 def _distance_at_peak(scene: Plan, arrays: ChainArrays, motion: Motion, rtol: float) -> float:

@@ -65,13 +65,10 @@ def freeze_numbers(spring: Any, law: Law) -> None:
 
 def freeze_terms(spring: object, given: Any) -> None:
     """Convert relaxation terms to pairs of floats; InputError if they are not admissible."""
-    wanted = "relaxation must be a sequence of pairs (g, tau in s)"
     try:
-        pairs = [tuple(pair) for pair in given]
-    except TypeError:
-        raise InputError(wanted) from None
-    if any(len(pair) != 2 for pair in pairs):
-        raise InputError(wanted)
+        pairs = [(g, tau) for g, tau in given]
+    except (TypeError, ValueError):
+        raise InputError("relaxation must be a sequence of pairs (g, tau in s)") from None
     terms = []
     for k, (g, tau) in enumerate(pairs, start=1):
         g, tau = as_number(g, f"g{k}"), as_number(tau, f"tau{k}")
