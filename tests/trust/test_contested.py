@@ -122,6 +122,13 @@ def test_a_lag_of_the_force_determines_nothing_until_it_is_fitted(tmp_path: Path
     assert far(fitted, made.truth) == []
 
 
+def test_starts_are_read_off_the_loop_as_the_striker_delays_it(tmp_path: Path) -> None:
+    """From the loop as filed, the search ended in another minimum, one value of it determined."""
+    made = record_of(7, delay_sd=0.1)
+    result = ff.fit(ff.read_test(rig.write(made, tmp_path)), model="microscale", **QUICK)
+    assert far(result, made.truth) == []
+
+
 def test_a_stated_delay_that_the_record_excludes_is_named(tmp_path: Path) -> None:
     """Eight standard deviations off, kc was determined, seven errors from the truth."""
     made = record_of(2, delay_sd=0.1)

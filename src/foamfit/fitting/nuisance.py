@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from foamfit.data.calibration import balance
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import INTEGRATED, Measurement
 from foamfit.data.noise import lowest_mean
@@ -134,6 +135,15 @@ def shown_by(measurement: Measurement, drive: str, *, late: bool = False) -> dic
     if drive == "impact":
         out[CONTACT_TIME] = Prior(CONTACT_TIME, contact, error)
     return out
+
+
+def aligned(measurement: Measurement) -> dict[str, float]:
+    """Return delay (s) and zero (m) of a motion that may be late, as the striker shows them."""
+    late, motion = balance(measurement).delay, measurement.displacement
+    if late is None or motion is None:
+        return {}
+    zero = float(np.interp(late[0], measurement.instants, motion))
+    return {TIME_SHIFT: late[0], "displacement_zero": zero}
 
 
 def open_zero(measurement: Measurement, *, glued: bool) -> float:

@@ -189,6 +189,8 @@ def _add_nuisance(
     }
     free = nuisance.open_in(measurement, drive, counted) | {nuisance.TIME_SHIFT}
     usual = nuisance.values_of(measurement)
+    if late and drive == "impact":
+        usual |= nuisance.aligned(measurement)
     for name in nuisance.names_of(drive, time_shift=late):
         low, high = nuisance.limits_of(name, measurement, drive, scales.duration, late=late)
         origin = measurement.origins.get(name, 0.0)

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
-from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.starts import (
     CURVE_STARTS,
@@ -275,6 +274,8 @@ def search(
         promising = [item for item in ranked if item[0] <= PROMISING * ranked[0][0]]
         points = [point for _, point in distinct(promising)][: max(3, starts // 4)]
         points += [point for _, point in distinct(rank(tracker, space, given))[:LEAST]]
+        if attempt > 0:
+            points += [p for _, p in rank(tracker, space, around(space, ranked[0][1], rng))[:3]]
         for i, point in enumerate(points):
             progress(ON_CURVES + (REFINED - ON_CURVES) * i / len(points), "curves")
             cost, end = descend(tracker, space, point, 60)
@@ -391,8 +392,7 @@ def _search_loop(
     inner = Tracker(along, tracker.deadline, tracker.better)
     own = space
     if objective.drive == "impact":  # contact and zeros do not affect its loop
-        free = [name for name in space.free if name not in NUISANCE or name == TIME_SHIFT]
-        own = replace(space, free=tuple(free))
+        own = replace(space, free=tuple(one for one in space.free if one not in NUISANCE))
     try:
         points = [own.encode(space.decode(point)) for point in points]
         ranked = rank(inner, own, points + curve_starts(own, loop, rng))

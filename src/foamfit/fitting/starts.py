@@ -17,6 +17,7 @@ from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of, find_turns
 from foamfit.data.measurement import Measurement
 from foamfit.fitting.box import Space
+from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.springs.laws.record import Law, Param
 from foamfit.springs.loop import Loop
 from foamfit.springs.parameters import family, relaxation_names, split_name
@@ -89,7 +90,10 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
     count, relaxing = len(laws), 2 * model.relaxation * sum(law.hysteretic for law in laws)
     more = sum(max(law.wanted_marks - OWN_MARKS, 0) for law in laws if law.hysteretic)
     marks = qmc.LatinHypercube(7 * count + more + relaxing, rng=rng).random(CURVE_STARTS)
-    starts, once = [], next(iter(cycles_of(loop).values()), slice(None))
+    starts, once, begun = [], next(iter(cycles_of(loop).values()), slice(None)), loop.displacement
+    if late := space.values[space.names.index(TIME_SHIFT)] if TIME_SHIFT in space.names else 0.0:
+        begun = np.interp(loop.instants + late, loop.instants, begun)
+        begun = begun - space.values[space.names.index("displacement_zero")]
     lines = [law.own == ("k0",) for law in laws]
     ways = range(max(law.ways for law in laws))
     for (turn, mark), way in product(enumerate(marks), ways):
@@ -102,7 +106,7 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
                     values[at] = heights[i] * (0.3 + 1.4 * mark[7 * i + 5])
             values = space.complete(values)
             heights = np.maximum(values[given], 1e-3 * space.scales.height)
-        motion, stress = loop.displacement[once], loop.stress[once]
+        motion, stress = begun[once], loop.stress[once]
         for i in range(count):
             if lines[i]:
                 share = 10.0 ** (-3.0 + 2.7 * mark[7 * i + 6])
@@ -149,7 +153,7 @@ def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array
     """Return a Latin hypercube over the inner part of the box, independent of the curves."""
     limits = [
         one.param.start_limits if one.param is not None
-        else LATE if one.short == "time_shift" else NEAR_USUAL
+        else LATE if one.short == TIME_SHIFT else NEAR_USUAL
         for one in space.coordinates
     ]  # fmt: skip
     low, high = np.array(limits).reshape(-1, 2).T
