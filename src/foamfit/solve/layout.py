@@ -12,32 +12,9 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.solve import cache
-from foamfit.solve.compiled.run import (
-    BATCH,
-    DRIVE,
-    FLOATS,
-    GIVEN,
-    LINE,
-    NOW,
-    NUMBERS,
-    OF_SIGMA,
-    SCALES,
-    STAGES,
-    SYSTEMS,
-    WORDS,
-)
+from foamfit.solve.compiled import run
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
-from foamfit.springs.compiled import compiled
-from foamfit.springs.compiled.contract import (
-    BY,
-    BY_STRESS,
-    FADES,
-    INTERNAL,
-    MOST_TERMS,
-    RESULTS,
-    Compiled,
-    results_of,
-)
+from foamfit.springs.compiled import compiled, contract
 from foamfit.springs.laws.record import OWN_ETA, Law
 
 Memory = tuple[NDArray[np.int64], Array]  # the integers and floats of a run
@@ -76,7 +53,7 @@ def _groups(shape: Shape) -> list[range]:
 def place_state(shape: Shape, numbers: np.recarray, nodes: int) -> tuple[list[int], int]:
     """Give every component its place; return the kinds, and how many have derivatives."""
     damped = np.frombuffer(shape.damped, bool)
-    more, count = SCALES + len(shape.laws) + 2 * nodes, len(shape.laws)
+    more, count = run.SCALES + len(shape.laws) + 2 * nodes, len(shape.laws)
     kinds = list(range(more - 2 * nodes, more))
     several = [False] * count
     for g, springs in enumerate(_groups(shape)):
@@ -90,10 +67,10 @@ def place_state(shape: Shape, numbers: np.recarray, nodes: int) -> tuple[list[in
         own.fixed = several[i] and not damped[i]
         if several[i] and damped[i]:
             own.eps_at = len(kinds)
-            kinds.append(SCALES + i)
+            kinds.append(run.SCALES + i)
         own.z_at = len(kinds)
-        kinds += [OF_SIGMA] * shape.terms
-        if own.kind == INTERNAL:
+        kinds += [run.OF_SIGMA] * shape.terms
+        if own.internal:
             own.x_at, inside = len(kinds), int(own.internals)
             kinds += range(more, more + inside)
             more += inside
@@ -101,10 +78,10 @@ def place_state(shape: Shape, numbers: np.recarray, nodes: int) -> tuple[list[in
     for i, own in enumerate(numbers):
         if not shape.solved and several[i] and own.eps_at < 0:
             own.eps_at = len(kinds)
-            kinds.append(SCALES + i)
-        if not shape.solved and own.kind == BY_STRESS:
+            kinds.append(run.SCALES + i)
+        if not shape.solved and own.by_stress:
             own.x_at = len(kinds)
-            kinds.append(OF_SIGMA)
+            kinds.append(run.OF_SIGMA)
     return kinds, carries
 
 
@@ -123,7 +100,7 @@ def order(shape: Shape, numbers: np.recarray, nodes: int) -> tuple[list[int], li
             if own.eps_at >= 0 and damped[i]:
                 one.append(int(own.eps_at))
             one += range(int(own.z_at), int(own.z_at) + shape.terms)
-            if own.kind == INTERNAL:
+            if own.internal:
                 one += range(int(own.x_at), int(own.x_at + own.internals))
         found += [(k, g) for k in one]
         sizes.append(len(one))
@@ -168,9 +145,9 @@ def _functions(
     )
 
 
-def _memory_of_decay(one: Compiled, p: int) -> int:
+def _memory_of_decay(one: contract.Compiled, p: int) -> int:
     """Return the length of the memory of `decay`, 0 if it is not needed."""
-    return one.internal * (11 + 2 * 8 + 4 * p) if one.flows == FADES else 0
+    return one.internal * (11 + 2 * 8 + 4 * p) if one.flows == contract.FADES else 0
 
 
 def _memory_of_relaxation(shape: Shape, allowed: bool) -> int:
@@ -181,6 +158,12 @@ def _memory_of_relaxation(shape: Shape, allowed: bool) -> int:
     return count * (4 + 8 * shape.terms) if needed else 0
 
 
+def _numbers(one: contract.Compiled) -> tuple[int, ...]:
+    """Return the integers of a spring, without its places."""
+    kind = one.kind == contract.BY_STRESS, one.kind == contract.INTERNAL
+    return (*one.addresses, *kind, one.derivatives, one.internal, 0, 0, 0, 0)
+
+
 @lru_cache(maxsize=1024)
 def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     """Lay out a run; `integrated` is whether it takes steps in time."""
@@ -189,46 +172,45 @@ def lay_out(shape: Shape, integrated: bool = True) -> Layout:
     count, groups, p = len(made), len(shape.ends), len(directions)
     nodes = groups if shape.top in (FREE, VISCOUS) else groups - 1
     numbers = np.array(
-        [(*one.addresses, one.kind, one.derivatives, one.internal, 0, 0, 0, 0) for one in made],
-        [(name, np.int64) for name in NUMBERS],
+        [_numbers(one) for one in made], [(name, np.int64) for name in run.NUMBERS]
     ).view(np.recarray)
     kinds, carries = place_state(shape, numbers, nodes)
     base, internals = len(kinds), sum(one.internal for one in made)
     n = base + carries * p
-    results = max(results_of(one.derivatives, one.internal, p) for one in made)
+    results = max(contract.results_of(one.derivatives, one.internal, p) for one in made)
     wide = -4 * (-n // 4)
-    row = RESULTS + results
+    row = contract.RESULTS + results
     width = row + max(one.columns for one in made)
     places, groups_of, reach = order(shape, numbers, nodes) if shape.degree else ([], [], 0)
     size = carries if shape.degree else 0
     parameters = max(one.derivatives for one in made)
-    internal = any(one.kind == INTERNAL for one in made)
+    internal = any(one.kind == contract.INTERNAL for one in made)
     fades = 0 if integrated else _memory_of_decay(made[0], p)
     relaxes = _memory_of_relaxation(shape, integrated and not internal)
     lengths = {
-        "springs": count * width, "per_mass": groups, "drive": len(DRIVE), "carried": groups,
+        "springs": count * width, "per_mass": groups, "drive": len(run.DRIVE), "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
         "common": (groups + 3) * p, "strain": count * p,
-        "scales": SCALES + count + 2 * nodes + internals,
-        "now": len(NOW), "stage": STAGES * wide, "line": LINE * wide, "y": wide,
+        "scales": run.SCALES + count + 2 * nodes + internals,
+        "now": len(run.NOW), "stage": run.STAGES * wide, "line": run.LINE * wide, "y": wide,
         "new": wide, "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
-        "batch": BATCH * (6 + BY + parameters) + 2 * p + 8 * MOST_TERMS + 8,
+        "batch": run.BATCH * (6 + contract.BY + parameters) + 2 * p + 8 * contract.MOST_TERMS + 8,
         "aside": max(fades, relaxes, internal * (count * (1 + shape.terms) + groups + 1)),
         "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,
         "largest": p if size else 0, "kept": count * width + groups if size and p else 0,
-        "systems": 2 * SYSTEMS * size * (3 * reach + 1),
-        "right": 2 * SYSTEMS * size,
+        "systems": 2 * run.SYSTEMS * size * (3 * reach + 1),
+        "right": 2 * run.SYSTEMS * size,
     }  # fmt: skip
     arrays = (
-        numbers.view(np.int64).tolist(), list(shape.ends), [k for pair in directions for k in pair],
-        _owned(count, directions), kinds, [0] * (SYSTEMS * size), places, groups_of,
+        numbers.view(np.int64).tolist(), [0, *shape.ends], [k for pair in directions for k in pair],
+        _owned(count, directions), kinds, [0] * (run.SYSTEMS * size), places, groups_of,
     )  # fmt: skip
-    at = np.cumsum([0, *(lengths[name] for name in FLOATS)])
-    whole = np.cumsum([WORDS, *map(len, arrays)])
+    at = np.cumsum([0, *(lengths[name] for name in run.FLOATS)])
+    whole = np.cumsum([run.WORDS, *map(len, arrays)])
     several = any(len(springs) > 1 for springs in _groups(shape))
     several = several or shape.top in (STRESS, VISCOUS)
     words = [
-        *at[:-1], *whole[:-1], *([0] * len(GIVEN)),
+        *at[:-1], *whole[:-1], *([0] * len(run.GIVEN)),
         *_functions(shape, integrated, several, internal, fades > 0, relaxes > 0),
         row, width, count, groups, nodes, p, base, carries, shape.terms, shape.top,
         int(shape.solved), wide, shape.degree, reach, 0, 0, 0, 0,

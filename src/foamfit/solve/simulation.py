@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -12,21 +12,8 @@ from numpy.typing import ArrayLike
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
-from foamfit.solve.plan import (
-    AGGREGATE,
-    CLOSED_FORM,
-    EXPLICIT_STEPS,
-    FIRST_ORDER,
-    LEAST_TOL,
-    MOST_WORK,
-    NO_DIRECTIONS,
-    RADAU,
-    SECOND_ORDER,
-    Directions,
-    Motion,
-    Plan,
-    plan,
-)
+from foamfit.solve import plan as plans
+from foamfit.solve.plan import NO_DIRECTIONS, Directions, Motion, Plan, plan
 from foamfit.solve.scene import MOTION, Slopes, difference
 from foamfit.springs.chain import Chain, ChainArrays, Drive, check_scene
 from foamfit.springs.compiled.contract import BY_STRESS
@@ -105,7 +92,7 @@ def _verified(
     inside = groups > 2
     if groups == 2:  # the base stress depends on the velocity of the mass above
         inside = bool((rows[: scene.ends[0], 0] > 0.0).any())
-    long = inside or motion.method == RADAU or _is_long(scene, motion, FEW_STEPS)
+    long = inside or motion.method == plans.RADAU or _is_long(scene, motion, FEW_STEPS)
     if scene.speed > 0.0 and not long and not _hard(scene, arrays):
         return motion
 
@@ -116,7 +103,7 @@ def _verified(
     if lost > 0.7 * rtol:  # the comparison below leaves 0.3
         # An explicit step covers about 3 radians and costs 1 % of an implicit step.
         rates = scene.fastest_rates(rows, heights, scene.drag)
-        explicit = max(rates) / 3.0 <= MOST_WORK / len(heights)
+        explicit = max(rates) / 3.0 <= plans.MOST_WORK / len(heights)
         motion, scene = _resolve_vibrations(scene, motion, rtol, explicit, run)
     distance = _distance_at_peak(scene, arrays, motion, rtol)
     if 0.3 * rtol * distance < 1e-15:
@@ -127,10 +114,10 @@ def _verified(
     forced = 0 if scene.speed > 0.0 else scene.time.size
     long = _is_long(scene, motion, FEW_STEPS + 2 * forced) or inside
     long = long or min(distance, _distance_by_stress(scene, arrays, motion)) < CLOSE
-    long = (long and scene.solver == SECOND_ORDER) or sharp
-    if not (long or motion.method == RADAU) or rtol < 1e-12:  # a finer run would only round
+    long = (long and scene.solver == plans.SECOND_ORDER) or sharp
+    if not (long or motion.method == plans.RADAU) or rtol < 1e-12:  # a finer run would only round
         return motion
-    if motion.method == EXPLICIT_STEPS and not sharp:
+    if motion.method == plans.EXPLICIT_STEPS and not sharp:
         with suppress(SimulationError):
             if _agrees_with_longer_steps(scene, arrays, motion, rtol):
                 return motion
@@ -169,7 +156,7 @@ def _compared(
         if rtol * factor < 1e-14:
             break
         try:
-            finer = run(scene._replace(least=LEAST_TOL), rtol * factor)
+            finer = run(scene._replace(least=plans.LEAST_TOL), rtol * factor)
         except SimulationError:
             if scene.implicit is False:  # the last resort, see `_resolve_vibrations`
                 raise SimulationError(_UNRESOLVED.format(size=lost)) from None
@@ -195,7 +182,7 @@ def _may_snap_wrongly(scene: Plan) -> bool:
     In a snap of a narrow spread the smallest error of a strain may enter the wrong branch.
     """
     laws = scene.laws.made
-    if scene.solver != FIRST_ORDER or len(laws) == len(scene.ends):
+    if scene.solver != plans.FIRST_ORDER or len(laws) == len(scene.ends):
         return False
     return any(one.kind == BY_STRESS for one in laws)
 
@@ -223,8 +210,8 @@ def _resolve_vibrations(
 def _is_long(scene: Plan, motion: Motion, few: int) -> bool:
     """Whether a motion took many steps or switches (the steps of an aggregate are switches)."""
     bounces = len(scene.ends) > 1 or scene.speed == 0.0
-    vibrates = bounces and scene.solver == SECOND_ORDER and len(motion.switches) > FEW_SWITCHES
-    return (motion.steps > few or vibrates) and motion.method != AGGREGATE
+    many = scene.solver == plans.SECOND_ORDER and len(motion.switches) > FEW_SWITCHES
+    return (motion.steps > few or (bounces and many)) and motion.method != plans.AGGREGATE
 
 
 def _hard(scene: Plan, arrays: ChainArrays) -> bool:
@@ -232,15 +219,19 @@ def _hard(scene: Plan, arrays: ChainArrays) -> bool:
     return bool(0.5 * scene.mass.item(-1) * scene.speed**2 >= 6.0 * arrays.steep)
 
 
-def _distance(scene: Plan, arrays: ChainArrays, displacement: Array) -> float:
-    """Return the least distance, in strain, of any spring from 1 + ε_*; at most 1."""
-    strain = np.diff(displacement, axis=0, prepend=0.0).max(axis=1) / arrays.heights
-    least = 1.0
+def _poles(scene: Plan, arrays: ChainArrays) -> Iterator[tuple[int, float, float]]:
+    """Yield number, ε_* and k_c of each spring whose strain stays below 1 + ε_*."""
+    at = 1 + 2 * scene.terms
     for i, one in enumerate(scene.laws.made):
         if one.pole >= 0:
-            star = float(arrays.rows[i, 1 + 2 * scene.terms + one.pole])
-            least = min(least, 1.0 - (float(strain[i]) - max(star, 0.0)))
-    return least
+            yield i, arrays.rows.item(i, at + one.pole), arrays.rows.item(i, at + one.slopes[1])
+
+
+def _distance(scene: Plan, arrays: ChainArrays, displacement: Array) -> float:
+    """Return the least distance, in strain, of any spring from 1 + ε_*; at most 1."""
+    strain = (np.diff(displacement, axis=0, prepend=0.0).max(axis=1) / arrays.heights).tolist()
+    left = [1.0 - (strain[i] - max(star, 0.0)) for i, star, _ in _poles(scene, arrays)]
+    return float(min([1.0, *left]))
 
 
 def _distance_by_stress(scene: Plan, arrays: ChainArrays, motion: Motion) -> float:
@@ -249,12 +240,7 @@ def _distance_by_stress(scene: Plan, arrays: ChainArrays, motion: Motion) -> flo
     It is that at which branch c has the largest stress of any spring. A mass may rebound from the
     end of a branch between two samples.
     """
-    least, at = 1.0, 1 + 2 * scene.terms
-    for i, one in enumerate(scene.laws.made):
-        if one.pole >= 0:
-            kc = float(arrays.rows[i, at + one.slopes[1]])
-            least = min(least, kc / (kc + motion.strongest))
-    return least
+    return min([1.0, *(kc / (kc + motion.strongest) for _, _, kc in _poles(scene, arrays))])
 
 
 def _distance_at_peak(scene: Plan, arrays: ChainArrays, motion: Motion, rtol: float) -> float:
@@ -264,7 +250,7 @@ def _distance_at_peak(scene: Plan, arrays: ChainArrays, motion: Motion, rtol: fl
     """
     rows, heights = arrays.rows, arrays.heights
     distance = _distance(scene, arrays, motion.displacement)
-    if scene.solver == CLOSED_FORM or scene.speed == 0.0 or not _hard(scene, arrays):
+    if scene.solver == plans.CLOSED_FORM or scene.speed == 0.0 or not _hard(scene, arrays):
         return distance
     low, high = 0.0, float(scene.time[-1])
     for _ in range(12):

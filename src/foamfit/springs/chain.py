@@ -9,18 +9,17 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.springs.laws.record import Law
-from foamfit.springs.spring import Spring, as_number, as_samples
+from foamfit.springs.spring import Spring, as_history, as_number
 
 
-def _finite(value: object, name: str, least: float, strict: bool) -> float:
+def _finite(value: object, name: str, strict: bool) -> float:
     number = as_number(value, name)
-    if not math.isfinite(number) or number < least or (strict and number == least):
-        wanted = f"greater than {least:g}" if strict else f"at least {least:g}"
+    if not math.isfinite(number) or number < 0.0 or (strict and number == 0.0):
+        wanted = "greater than 0" if strict else "at least 0"
         raise InputError(f"{name} = {number:g} is not admissible: it must be finite and {wanted}")
     return number
 
@@ -35,14 +34,6 @@ def _listed(values: Any, name: str, wanted: str) -> tuple[Any, ...]:
     raise InputError(
         f"{name} = {values!r} is not admissible: it must be a sequence of {wanted}, base first"
     )
-
-
-def padded(rows: Sequence[Array]) -> Array:
-    """Return rows of several lengths as one array, padded with zeros."""
-    out = np.zeros((len(rows), max(row.size for row in rows)))
-    for line, row in zip(out, rows, strict=True):
-        line[: row.size] = row
-    return out
 
 
 class ChainArrays(NamedTuple):
@@ -119,10 +110,10 @@ class Chain:
                 )
         put = object.__setattr__
         put(self, "springs", tuple(springs))
-        put(self, "heights", tuple(_finite(h, "heights", 0.0, True) for h in heights))
-        put(self, "area", _finite(area, "area", 0.0, True))
-        put(self, "masses", tuple(_finite(m, "masses", 0.0, False) for m in masses))
-        put(self, "site_damping", _finite(site_damping, "site_damping", 0.0, False))
+        put(self, "heights", tuple(_finite(h, "heights", True) for h in heights))
+        put(self, "area", _finite(area, "area", True))
+        put(self, "masses", tuple(_finite(m, "masses", False) for m in masses))
+        put(self, "site_damping", _finite(site_damping, "site_damping", False))
 
     @cached_property
     def height(self) -> float:
@@ -150,7 +141,10 @@ class Chain:
         from foamfit.springs.compiled import compiled, slopes_of
 
         room = max(self.relaxation)
-        rows = padded([one.solver_row(room) for one in self.springs])
+        made = [one.solver_row(room) for one in self.springs]
+        rows = np.zeros((len(made), max(row.size for row in made)))
+        for line, row in zip(rows, made, strict=True):
+            line[: row.size] = row
         steep = slopes_of([compiled(law) for law in self.laws], rows[:, 1 + 2 * room :])[1]
         heavy = [i for i, mass in enumerate(self.masses[:-1]) if mass > 0.0]
         return ChainArrays(
@@ -161,17 +155,6 @@ class Chain:
             damped=any(spring.eta > 0.0 for spring in self.springs),
             steep=float(steep @ np.array(self.heights)),
         )
-
-
-def _samples(values: ArrayLike, name: str) -> Array:
-    samples = as_samples(values, name)
-    if samples.ndim != 1 or samples.size == 0:
-        raise InputError(f"{name} must be a one-dimensional array with at least one sample")
-    if not np.all(np.isfinite(samples)):
-        at = int(np.argmin(np.isfinite(samples)))
-        raise InputError(f"{name} must be finite; sample {at} is {samples[at]}")
-    samples.setflags(write=False)
-    return samples
 
 
 @dataclass(frozen=True)
@@ -187,31 +170,34 @@ class Impact:
 
     def __post_init__(self) -> None:
         """Raise InputError for an inadmissible value; the message names it."""
-        object.__setattr__(self, "mass", _finite(self.mass, "mass", 0.0, True))
-        object.__setattr__(self, "velocity", _finite(self.velocity, "velocity", 0.0, True))
-        object.__setattr__(self, "gravity", _finite(self.gravity, "gravity", 0.0, False))
+        for name in ("mass", "velocity", "gravity"):
+            value = _finite(getattr(self, name), name, name != "gravity")
+            object.__setattr__(self, name, value)
+
+
+class _Sampled:
+    """A drive that is sampled at t and linear in between."""
+
+    def __post_init__(self) -> None:
+        """Check the samples and make them immutable."""
+        for name, values in tuple(vars(self).items()):
+            samples = as_history(values, name)
+            samples.setflags(write=False)
+            object.__setattr__(self, name, samples)
 
 
 @dataclass(frozen=True, eq=False)
-class StressDrive:
+class StressDrive(_Sampled):
     """A prescribed stress (Pa) on the top, sampled at t and linear in between, from rest."""
 
     stress: Array
 
-    def __post_init__(self) -> None:
-        """Check the samples and make them immutable."""
-        object.__setattr__(self, "stress", _samples(self.stress, "stress"))
-
 
 @dataclass(frozen=True, eq=False)
-class DisplacementDrive:
+class DisplacementDrive(_Sampled):
     """A prescribed displacement (m) of the top, sampled at t and linear in between."""
 
     displacement: Array
-
-    def __post_init__(self) -> None:
-        """Check the samples and make them immutable."""
-        object.__setattr__(self, "displacement", _samples(self.displacement, "displacement"))
 
 
 Drive = Impact | StressDrive | DisplacementDrive

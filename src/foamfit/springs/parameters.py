@@ -11,16 +11,8 @@ from collections.abc import Iterable
 
 from foamfit.errors import InputError
 from foamfit.springs import laws
-from foamfit.springs.laws.record import (
-    COMMON,
-    DRAG,
-    ETA,
-    OWN_ETA,
-    OWN_HEIGHT,
-    OWN_RELAXATION,
-    Law,
-    Param,
-)
+from foamfit.springs.laws import record
+from foamfit.springs.laws.record import COMMON, Law, Param
 
 # Nuisance parameters (see `fitting.nuisance`) and their units.
 NUISANCE = {
@@ -94,20 +86,20 @@ def direction(
     Raises InputError if springs with these numbers of relaxation terms do not have it.
     """
     if name == "site_eta":
-        return -1, DRAG
+        return -1, record.DRAG
     prefix, _, short = name.partition("_")
     known = [f"s{i}" for i in range(1, len(chain) + 1)]
     if prefix in known:
         spring = known.index(prefix)
         law, terms = chain[spring], relaxation[spring] if relaxation else 0
         if short == "height":
-            return spring, OWN_HEIGHT
-        if short == ETA.name:
-            return spring, OWN_ETA
+            return spring, record.OWN_HEIGHT
+        if short == record.ETA.name:
+            return spring, record.OWN_ETA
         if short in law.own:
             return spring, law.derivative(short)
         if short in names_of(law, terms):
-            return spring, OWN_RELAXATION + relaxation_names(terms).index(short)
+            return spring, record.OWN_RELAXATION + relaxation_names(terms).index(short)
     raise InputError(
         f"sensitivities: '{name}' is not a parameter of this chain; give names like s1_k0, "
         "s2_height or site_eta"

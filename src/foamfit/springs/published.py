@@ -55,33 +55,20 @@ def _bistable(k0: float, drop: float, eps_a: float, eps_c: float, *ratios: float
     return BistableSpring(slope, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus)
 
 
-_AREA = math.pi / 4.0 * (5.0 * MM) ** 2
 _FOAM_1 = {"specimen_mass": 5.56 * MG, "density": 238.0, "striker_velocity": 1.75}
 _FOAM_2 = {"specimen_mass": 5.05 * MG, "density": 232.0, "striker_velocity": 4.44}
 
 
-def _one_spring(name: str, kh_minus: float, eta: float | None, ratio: float | None) -> PublishedSet:
-    spring = _bistable(5.50, -0.20, 0.14, 0.31, 2.60, kh_minus, 15.0)
-    chain = Chain([spring], [1.190 * MM], _AREA, site_damping=eta or 0.0)
-    return PublishedSet(name, "bistable", chain, eta, ratio, striker_mass=7e-3, **_FOAM_1)
-
-
-def _model_3() -> PublishedSet:
-    bistable = _bistable(2.0, -0.32, 0.35, 0.71, 3.40, 0.525, 30.0)
-    springs = [LinearSpring(60 * MPA), bistable]
-    chain = Chain(springs, [0.700 * MM, 0.490 * MM], _AREA, [5.56 * MG, 0.0], site_damping=3e2)
-    return PublishedSet(
-        "foam-1/model-3", "linear+bistable", chain, 3e2, 0.0297, striker_mass=7e-3, **_FOAM_1
-    )
-
-
-def _foam_2() -> PublishedSet:
-    bistable = _bistable(5.75, -0.80, 0.40, 0.70, 6.00, 0.200, 40.0)
-    springs = [LinearSpring(250 * MPA, unilateral=True), bistable]
-    chain = Chain(springs, [0.350 * MM, 0.756 * MM], _AREA, [5.05 * MG, 0.0], site_damping=1e4)
-    return PublishedSet(
-        "foam-2", "linear+bistable", chain, 1e4, 0.525, striker_mass=7e-3, **_FOAM_2
-    )
+def _set(
+    name: str, foam: dict[str, float], heights: list[float], springs: list[Spring],
+    eta: float | None, ratio: float | None,
+) -> PublishedSet:  # fmt: skip
+    """Return a set of springs with these heights (mm), η and the damping ratio of the paper."""
+    area = math.pi / 4.0 * (5.0 * MM) ** 2
+    masses = [foam["specimen_mass"]] * (len(springs) - 1) + [0.0]
+    chain = Chain(springs, [h * MM for h in heights], area, masses, site_damping=eta or 0.0)
+    model = "+".join("linear" if isinstance(s, LinearSpring) else "bistable" for s in springs)
+    return PublishedSet(name, model, chain, eta, ratio, striker_mass=7e-3, **foam)
 
 
 class _Sets(dict[str, PublishedSet]):
@@ -94,12 +81,29 @@ class _Sets(dict[str, PublishedSet]):
 published: dict[str, PublishedSet] = _Sets(
     (item.name, item)
     for item in (
-        _one_spring("foam-1/model-1", 0.450, None, None),
-        _one_spring("foam-1/model-2", 0.425, 1e4, 0.894),
-        _model_3(),
-        _foam_2(),
+        _set(
+            "foam-1/model-1", _FOAM_1, [1.190],
+            [_bistable(5.50, -0.20, 0.14, 0.31, 2.60, 0.450, 15.0)], None, None,
+        ),
+        _set(
+            "foam-1/model-2", _FOAM_1, [1.190],
+            [_bistable(5.50, -0.20, 0.14, 0.31, 2.60, 0.425, 15.0)], 1e4, 0.894,
+        ),
+        _set(
+            "foam-1/model-3", _FOAM_1, [0.700, 0.490],
+            [LinearSpring(60 * MPA), _bistable(2.0, -0.32, 0.35, 0.71, 3.40, 0.525, 30.0)],
+            3e2, 0.0297,
+        ),
+        _set(
+            "foam-2", _FOAM_2, [0.350, 0.756],
+            [
+                LinearSpring(250 * MPA, unilateral=True),
+                _bistable(5.75, -0.80, 0.40, 0.70, 6.00, 0.200, 40.0),
+            ],
+            1e4, 0.525,
+        ),
     )
-)
+)  # fmt: skip
 
 
 def table() -> str:

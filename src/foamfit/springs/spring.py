@@ -65,13 +65,10 @@ def freeze_numbers(spring: Any, law: Law) -> None:
 
 def freeze_terms(spring: object, given: Any) -> None:
     """Convert relaxation terms to pairs of floats; InputError if they are not admissible."""
-    wanted = "relaxation must be a sequence of pairs (g, tau in s)"
     try:
-        pairs = [tuple(pair) for pair in given]
-    except TypeError:
-        raise InputError(wanted) from None
-    if any(len(pair) != 2 for pair in pairs):
-        raise InputError(wanted)
+        pairs = [(g, tau) for g, tau in given]
+    except (TypeError, ValueError):
+        raise InputError("relaxation must be a sequence of pairs (g, tau in s)") from None
     terms = []
     for k, (g, tau) in enumerate(pairs, start=1):
         g, tau = as_number(g, f"g{k}"), as_number(tau, f"tau{k}")
@@ -81,19 +78,21 @@ def freeze_terms(spring: object, given: Any) -> None:
     object.__setattr__(spring, "relaxation", tuple(terms))
 
 
-def _as_history(values: ArrayLike, name: str) -> Array:
-    history = np.ascontiguousarray(as_samples(values, name))
-    if history.ndim > 1:
-        raise InputError(f"{name} must be one history (one dimension), not {history.ndim}")
-    if not history.size:
-        raise InputError(f"{name} must have at least one sample")
-    if not np.all(np.isfinite(history)):
-        raise InputError(f"{name} must be finite; sample {_first(~np.isfinite(history))} is not")
-    return np.atleast_1d(history)
+def first_infinite(values: Array) -> int | None:
+    """Return the first sample that is not finite; None if all are."""
+    finite = np.isfinite(values)
+    return None if finite.all() else int(np.argmin(finite))
 
 
-def _first(mask: NDArray[np.bool_]) -> int:
-    return int(np.argmax(np.atleast_1d(mask)))
+def as_history(values: ArrayLike, name: str, *, or_number: bool = False) -> Array:
+    """Return a history of finite numbers, (n,), as a new array; `or_number`: one will do."""
+    samples = as_samples(values, name)
+    history = np.atleast_1d(samples) if or_number else samples
+    if history.ndim != 1 or not history.size:
+        raise InputError(f"{name} must be a one-dimensional array with at least one sample")
+    if (at := first_infinite(history)) is not None:
+        raise InputError(f"{name} must be finite; sample {at} is {history[at]}")
+    return history
 
 
 class Spring(ABC):
@@ -162,10 +161,9 @@ class Spring(ABC):
         """
         from foamfit.solve.histories import strain_along
 
-        history = _as_history(stress, "stress")
+        history = as_history(stress, "stress", or_number=True)
         strain = strain_along(self.law, self.row, history)
-        if not np.all(np.isfinite(strain)):
-            at = _first(~np.isfinite(strain))
+        if (at := first_infinite(strain)) is not None:
             raise SimulationError(
                 f"stress {history[at]:g} Pa (sample {at}) is a tension that the spring cannot carry"
             )
@@ -192,10 +190,9 @@ class Spring(ABC):
         """Return strains, stresses and branches along a strain history."""
         from foamfit.solve.histories import stress_along
 
-        history = _as_history(strain, "strain")
+        history = as_history(strain, "strain", or_number=True)
         stress, branches = stress_along(self.law, self.row, history)
-        if not np.all(np.isfinite(stress)):
-            at = _first(~np.isfinite(stress))
+        if (at := first_infinite(stress)) is not None:
             raise SimulationError(
                 f"strain {history[at]:g} (sample {at}) is at or past the end of its branch, "
                 "where the stress is infinite: 1 on branch a, 1 + eps_star on branch c"

@@ -21,36 +21,9 @@ from functools import lru_cache
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.springs.compiled.bistable import (
-    COLUMNS,
-    EPS_A,
-    EPS_C,
-    EPS_HAT_A,
-    EPS_HAT_C,
-    TABLE,
-    TO_STRESS,
-    WIDE,
-    A,
-    C,
-    D,
-    E,
-)
-from foamfit.springs.compiled.contract import (
-    BY_STRESS,
-    MISS,
-    OF_LAW,
-    REAL,
-    SLOPE,
-    Compiled,
-    Named,
-    beginning,
-    evaluating,
-    inner,
-    outer,
-    past,
-    pointing,
-    switching,
-)
+from foamfit.springs.compiled import bistable, contract
+from foamfit.springs.compiled.bistable import A, C, D, E
+from foamfit.springs.compiled.contract import MISS, OF_LAW, SLOPE, inner, past
 from foamfit.springs.laws.record import Law
 
 # Columns of the shape of a branch: 1 if curved, slope k, origins of strain and stress, stresses at
@@ -72,25 +45,25 @@ _NAMES = ("count", "leaves", "anchor", "unit", "least", "changes", "switches")
 HEAD = len(_NAMES)
 SPRINGS, OF_SPRING = HEAD + DEGREE + 1, 2 + 4 * SHAPE
 MOST_SWITCHES = 4  # of a spring in an impact
-as_row = pointing(Named("Aggregate", REAL, {name: k for k, name in enumerate(_NAMES)}))
+as_row = contract.naming("Aggregate", _NAMES)
 
 
 @inner
-def _shape(row, i):  # type: ignore[no-untyped-def]
+def _shape(row, i):
     """Return the shape of the branch of a spring."""
     own = past(row, SPRINGS + i * OF_SPRING)
     return past(own, 2 + int(own[0]) * SHAPE)
 
 
 @inner
-def _tree(row, up):  # type: ignore[no-untyped-def]
+def _tree(row, up):
     """Return a tree of switching stresses."""
     first = SPRINGS + int(row.count) * OF_SPRING
     return past(row, first if up else first + 2 * int(row.leaves))
 
 
 @inner
-def _set(tree, at, value):  # type: ignore[no-untyped-def]
+def _set(tree, at, value):
     """Set a leaf of a tree and update the nodes above it."""
     tree[at] = value
     while at > 1:
@@ -99,7 +72,7 @@ def _set(tree, at, value):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _enter(row, i, branch):  # type: ignore[no-untyped-def]
+def _enter(row, i, branch):
     """Put a spring on a branch."""
     row[SPRINGS + i * OF_SPRING] = branch
     shape, leaf = _shape(row, i), int(row.leaves) + i
@@ -108,7 +81,7 @@ def _enter(row, i, branch):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _add(row, i, times):  # type: ignore[no-untyped-def]
+def _add(row, i, times):
     """Add the strain of a spring to the polynomial, or subtract it (`times` -1).
 
     On a curved branch ε = x0 + 1 - k/(k + S), a geometric series.
@@ -128,7 +101,7 @@ def _add(row, i, times):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _anchor(row, stress, rising):  # type: ignore[no-untyped-def]
+def _anchor(row, stress, rising):
     """Recompute the polynomial about an anchor ahead of the stress, which stays in its reach."""
     ahead = REACH if rising else -REACH
     row.anchor = (stress + ahead * row.least) / (1.0 - ahead)
@@ -140,7 +113,7 @@ def _anchor(row, stress, rising):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _at(row, stress):  # type: ignore[no-untyped-def]
+def _at(row, stress):
     """Return strain and dε/dS at a stress."""
     x, total = (stress - row.anchor) / row.unit, past(row, HEAD)
     value, slope = total[DEGREE], 0.0
@@ -151,7 +124,7 @@ def _at(row, stress):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _bound(row, s):  # type: ignore[no-untyped-def]
+def _bound(row, s):
     """Set the ends of the present branch: the next switch, or the reach of the polynomial."""
     reach = REACH * row.unit
     s.sigma_high = min(_tree(row, True)[1], row.anchor + reach)
@@ -160,7 +133,7 @@ def _bound(row, s):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _strain(shape, stress):  # type: ignore[no-untyped-def]
+def _strain(shape, stress):
     """Return the strain of a spring on its branch."""
     k = shape[STEEP]
     part = stress / (k + stress) if shape[CURVED] > 0.0 else (stress - shape[OFFSET]) / k
@@ -168,7 +141,7 @@ def _strain(shape, stress):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _change(row, stress, up):  # type: ignore[no-untyped-def]
+def _change(row, stress, up):
     """Switch all springs that leave their branches at a stress."""
     tree, leaves = _tree(row, up), int(row.leaves)
     log = past(_tree(row, False), 2 * leaves)
@@ -192,8 +165,8 @@ def _change(row, stress, up):  # type: ignore[no-untyped-def]
         _anchor(row, stress, up)
 
 
-@beginning
-def _begin(row, s):  # type: ignore[no-untyped-def]
+@contract.beginning
+def _begin(row, s):
     row = as_row(row)
     for k in range(2 * int(row.leaves)):
         _tree(row, True)[k] = _tree(row, False)[k] = math.inf
@@ -205,8 +178,8 @@ def _begin(row, s):  # type: ignore[no-untyped-def]
     return 0.0
 
 
-@evaluating
-def _evaluate(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
+@contract.evaluating
+def _evaluate(row, s, eps, x, count, want, out):
     row = as_row(row)
     for j in range(count):
         strain, soft = _at(row, x[j])
@@ -215,8 +188,8 @@ def _evaluate(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
     return 0.0
 
 
-@switching
-def _switch(row, s, up, out):  # type: ignore[no-untyped-def]
+@contract.switching
+def _switch(row, s, up, out):
     row = as_row(row)
     s.eps, s.x = (s.high, s.sigma_high) if up else (s.low, s.sigma_low)
     _change(row, s.x, up != 0)
@@ -224,8 +197,8 @@ def _switch(row, s, up, out):  # type: ignore[no-untyped-def]
     return 0.0
 
 
-@outer
-def _place(shapes, heights, branches, log, time, stress, free, nodes):  # type: ignore[no-untyped-def]
+@contract.outer
+def _place(shapes, heights, branches, log, time, stress, free, nodes):
     """Fill the displacements above all springs but the last, whose displacement is known.
 
     From sample `free` on the chain flies with its top; `branches` are zeros.
@@ -264,28 +237,33 @@ def nodes_and_switches(
     return log
 
 
-def row_of(laws: tuple[Compiled, ...], rows: Array, heights: Array) -> Array | None:
+def row_of(laws: tuple[contract.Compiled, ...], rows: Array, heights: Array) -> Array | None:
     """Return the row of an aggregate; None if the springs cannot be one.
 
     They must be undamped bistable and linear springs without flat branches and gaps; `rows` have no
     relaxation terms.
     """
     own, count = rows[:, 1:], len(heights)
-    bistable = np.array([one.columns == COLUMNS for one in laws])
+    snapping = np.array([one.columns == bistable.COLUMNS for one in laws])
     linear = np.array([one.columns == 2 for one in laws])
-    if not (bistable | linear).all() or rows[:, 0].any() or (own[linear, 1] > 0.0).any():
+    if not (snapping | linear).all() or rows[:, 0].any() or (own[linear, 1] > 0.0).any():
         return None
     shapes = np.zeros((count, 4, SHAPE))
     shapes[:, :, FIRST], shapes[:, :, LAST] = -math.inf, math.inf
     shapes[linear, :, STEEP] = own[linear, :1]
-    ends = {A: (None, EPS_A), D: (EPS_A, EPS_HAT_C), C: (EPS_C, None), E: (EPS_HAT_A, EPS_C)}
+    ends = {
+        A: (None, bistable.EPS_A),
+        D: (bistable.EPS_A, bistable.EPS_HAT_C),
+        C: (bistable.EPS_C, None),
+        E: (bistable.EPS_HAT_A, bistable.EPS_C),
+    }
     for branch, places in ends.items():
-        first = TABLE + branch * WIDE
-        shapes[bistable, branch, CURVED] = float(branch in (A, C))
-        shapes[bistable, branch, STEEP:FIRST] = own[bistable, first : first + 3]
+        first = bistable.TABLE + branch * bistable.WIDE
+        shapes[snapping, branch, CURVED] = float(branch in (A, C))
+        shapes[snapping, branch, STEEP:FIRST] = own[snapping, first : first + 3]
         for column, end in zip((FIRST, LAST), places, strict=True):
             if end is not None:
-                shapes[bistable, branch, column] = own[bistable, TO_STRESS + end]
+                shapes[snapping, branch, column] = own[snapping, bistable.TO_STRESS + end]
     steep = shapes[:, :, STEEP]
     if not (steep > 0.0).all():
         return None
@@ -303,10 +281,10 @@ def _leaves(count: int) -> int:
 
 
 @lru_cache(maxsize=64)
-def law_of(count: int) -> tuple[Law, Compiled]:
+def law_of(count: int) -> tuple[Law, contract.Compiled]:
     """Return the law of an aggregate of so many springs."""
     columns = SPRINGS + count * OF_SPRING + 4 * _leaves(count) + 5 * MOST_SWITCHES * count
     # Explicit steps integrate its stress, so that `settle` and `strain` are not called.
-    addresses = _begin.address, _evaluate.address, _switch.address, 0, 0
-    made = Compiled(None, BY_STRESS, columns, 0, 1, addresses)
+    functions = _begin, _evaluate, _switch, bistable.settle, bistable.strain
+    made = contract.Compiled(None, contract.BY_STRESS, columns, 0, 1, functions)
     return Law("aggregate", (), made), made

@@ -11,42 +11,21 @@ from __future__ import annotations
 
 import math
 
-from foamfit.solve.compiled.events import change_branch
-from foamfit.solve.compiled.motion import PART, call_inside, evaluate
-from foamfit.solve.compiled.run import RECORD, begin_run
+from foamfit.solve.compiled.motion import PART, evaluate
+from foamfit.solve.compiled.run import begin_run, call_fade, call_inside, change_branch
 from foamfit.solve.compiled.samples import is_finite, row_of
 from foamfit.solve.scene import DONE, NOT_FINITE
-from foamfit.springs.compiled.contract import (
-    BY,
-    BY_HELD,
-    BY_STRESS,
-    INTERNAL,
-    REAL,
-    REALS_AT,
-    RELAX,
-    RESULTS,
-    WHOLE,
-    WHOLES_AT,
-    call_number,
-    calling,
-    inner,
-    outer,
-    past,
-    start,
-)
+from foamfit.springs.compiled.contract import call_number, inner, outer, past, start
 from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
 OF_STEP, TABLE = 6, 8  # columns of the table of a relaxation term, which begins with moments
 LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the middle adds
 LEAST_FADE = 1e-6  # least step with internal variables that decay
 SAME, TOO_LONG, UNFIT = range(3)  # ends of a step of `decay`; UNFIT if the law needs another solver
-#: record, strain, time until then, tolerance, derivatives by a shift of the motion, results
-FADING = WHOLE(WHOLES_AT, REAL, REAL, REAL, REALS_AT, REALS_AT)
-call_fade = calling(WHOLE, RECORD, REAL, REAL, REAL, REALS_AT, REALS_AT)
 
 
 @inner
-def bring_to(c, eps):  # type: ignore[no-untyped-def]
+def bring_to(c, eps):
     """Bring the spring to a strain on its branch; return the stress."""
     s, n = c.springs, c.numbers
     call_number(n.settle, past(s, c.row), s, eps)
@@ -55,26 +34,26 @@ def bring_to(c, eps):  # type: ignore[no-untyped-def]
 
 
 @inner
-def derive(c, seed):  # type: ignore[no-untyped-def]
+def derive(c, seed):
     """Fill the derivatives of the stress now in `part`, and those of the strain."""
     s, n, p = c.springs, c.numbers, c.p
-    out, held, part, strain = past(s, RESULTS), c.held, c.part, c.strain
-    if n.kind == INTERNAL:
+    held, part, strain = c.held, c.part, c.strain
+    if n.internal:
         call_inside(c, PART, c.none, c.none, c.y, c.y, c.y, part)
     for j in range(p):
         own = c.directions[2 * j + 1]
         strain[j] = s.per_height * (seed[0] + seed[1] * s.eps) if own == MOVED else 0.0
         if own == OWN_HEIGHT:
             strain[j] = -s.eps * s.per_height
-        if n.kind != INTERNAL:
-            part[j] = out[BY + own] if 0 <= own < OWN_ETA else 0.0
-        if n.kind == BY_STRESS:
-            part[j] += out[BY_HELD] * held[j] + out[BY_HELD + 1] * held[p + j]
+        if not n.internal:
+            part[j] = s.by[own] if 0 <= own < OWN_ETA else 0.0
+        if n.by_stress:
+            part[j] += s.by_held[0] * held[j] + s.by_held[1] * held[p + j]
         c.common[j] = part[j] + s.slope * strain[j]
 
 
 @inner
-def tabulate(x, h, table):  # type: ignore[no-untyped-def]
+def tabulate(x, h, table):
     """Fill the moments ∫₀¹ exp(-x (1-r)) r^m dr, m = 0 … 5, for steps of length h, if it is new."""
     if abs(h - table[OF_STEP]) <= 1e-13 * h:
         return
@@ -96,7 +75,7 @@ def tabulate(x, h, table):  # type: ignore[no-untyped-def]
 
 
 @inner
-def quartic(first, middle, last, low, high):  # type: ignore[no-untyped-def]
+def quartic(first, middle, last, low, high):
     """Return the coefficients 2 to 4 of a quartic with these values and slopes, and its `bump`.
 
     That is what the middle adds to the cubic of the ends: bump times 16 r² (1-r)².
@@ -107,7 +86,7 @@ def quartic(first, middle, last, low, high):  # type: ignore[no-untyped-def]
 
 
 @inner
-def integral(a, first, low, square, cube, fourth):  # type: ignore[no-untyped-def]
+def integral(a, first, low, square, cube, fourth):
     """Return ∫₀¹ exp(-x (1-r)) (first + low r + square r² + …) dr from the moments `a`.
 
     From the next moments, a + 1, it returns the integral with another factor r: the sum of this
@@ -117,16 +96,14 @@ def integral(a, first, low, square, cube, fourth):  # type: ignore[no-untyped-de
 
 
 @inner
-def relax(  # type: ignore[no-untyped-def]
-    c, h, tables, first, low, square, cube, fourth, d_first, d_middle
-):  # fmt: skip
+def relax(c, h, tables, first, low, square, cube, fourth, d_first, d_middle):
     """Advance the relaxation terms and their derivatives over a step.
 
     The stress is the quartic with these coefficients.
     """
     s, p, y = c.springs, c.p, c.y
     for k in range(c.terms):
-        tau, a, dz = s[RELAX + 2 * k + 1], past(tables, k * TABLE), past(y, c.base + k * p)
+        tau, a, dz = s.tau[k], past(tables, k * TABLE), past(y, c.base + k * p)
         x = h / tau
         decay = math.exp(-x)
         total = integral(a, first, low, square, cube, fourth)
@@ -142,7 +119,7 @@ def relax(  # type: ignore[no-untyped-def]
 
 
 @inner
-def sum_up(c, j):  # type: ignore[no-untyped-def]
+def sum_up(c, j):
     """Write stress and derivatives of a sample, with all terms."""
     s, p, y = c.springs, c.p, c.y
     sigma = s.sigma
@@ -150,17 +127,17 @@ def sum_up(c, j):  # type: ignore[no-untyped-def]
     for q in range(p):
         slope = c.common[q]
         for k in range(c.terms):
-            slope += s[RELAX + 2 * k] * (c.common[q] + y[c.base + k * p + q])
+            slope += s.g[k] * (c.common[q] + y[c.base + k * p + q])
             if c.directions[2 * q + 1] == OWN_RELAXATION + 2 * k:
                 slope += sigma + y[k]
         row_of(c, 1 + q, c.none)[j] = slope
     for k in range(c.terms):
-        total += s[RELAX + 2 * k] * (sigma + y[k])
+        total += s.g[k] * (sigma + y[k])
     row_of(c, c.none, c.none)[j] = total
 
 
 @inner
-def step_to(c, part, h, m, seed, tol, weight):  # type: ignore[no-untyped-def]
+def step_to(c, part, h, m, seed, tol, weight):
     """Step to a strain of the branch within h; false, unchanged, if the step is too long.
 
     m: largest stress, share of the interval (negative if the law needs another solver), tables,
@@ -179,7 +156,7 @@ def step_to(c, part, h, m, seed, tol, weight):  # type: ignore[no-untyped-def]
         derive(c, seed)
         return True
     if fades:
-        told = call_fade(c.fade_at, c, part, h, tol, seed, room)
+        told = call_fade(c, part, h, tol, seed, room)
         if told == TOO_LONG and m[1] > LEAST_FADE:
             return False
         if told != SAME:
@@ -197,7 +174,7 @@ def step_to(c, part, h, m, seed, tol, weight):  # type: ignore[no-untyped-def]
     size = max(m[0], abs(last))
     if FOLLOWED * weight * abs(bump) > tol * size and m[1] > LEAST_STEP:
         if fades:
-            call_fade(c.fade_at, c, origin, -1.0, tol, seed, room)
+            call_fade(c, origin, -1.0, tol, seed, room)
             return False
         s.eps, s.x = origin, x
         bring_to(c, origin)
@@ -207,13 +184,13 @@ def step_to(c, part, h, m, seed, tol, weight):  # type: ignore[no-untyped-def]
     m[0] = size
     derive(c, seed)
     for k in range(c.terms):
-        tabulate(h / s[RELAX + 2 * k + 1], h, past(tables, k * TABLE))
+        tabulate(h / s.tau[k], h, past(tables, k * TABLE))
     relax(c, h, tables, first, low, square, cube, fourth, d_first, d_middle)
     return True
 
 
 @inner
-def leave(c, up, seed):  # type: ignore[no-untyped-def]
+def leave(c, up, seed):
     """Change the branch; the strain may grow at any rate, as time does not count."""
     s = c.springs
     s.rate = 1.0 if up else -1.0
@@ -223,7 +200,7 @@ def leave(c, up, seed):  # type: ignore[no-untyped-def]
 
 
 @inner
-def go_to(c, eps, between, m, seed, tol, weight):  # type: ignore[no-untyped-def]
+def go_to(c, eps, between, m, seed, tol, weight):
     """Go to the strain of the next sample, `between` later, from branch to branch."""
     s, begun, left, pace = c.springs, c.springs.eps, 1.0, 1.0
     while left > 0.0 or s.eps != eps:
@@ -256,9 +233,7 @@ def go_to(c, eps, between, m, seed, tol, weight):  # type: ignore[no-untyped-def
 
 
 @outer
-def follow(  # type: ignore[no-untyped-def]
-    ints, floats, rows, heights, mass, reals, strains, time, out, log, samples
-):  # fmt: skip
+def follow(ints, floats, rows, heights, mass, reals, strains, time, out, log, samples):
     """Follow one spring, without its dashpot, along strains from rest.
 
     `samples` (n, 4) are derivatives by a shift of the motion, see `histories.at_samples`, then
@@ -269,11 +244,11 @@ def follow(  # type: ignore[no-untyped-def]
     s, t, tol, n, weight, m = c.springs, c.time, reals[3], c.samples, 0.0, c.batch
     lasts = t[n - 1] - t[0]
     for k in range(c.terms):
-        weight += s[RELAX + 2 * k] * min(1.0, lasts / s[RELAX + 2 * k + 1])
+        weight += s.g[k] * min(1.0, lasts / s.tau[k])
     bring_to(c, 0.0)
     derive(c, start(samples))
     if c.fade_at:
-        call_fade(c.fade_at, c, 0.0, 0.0, tol, start(samples), m)
+        call_fade(c, 0.0, 0.0, tol, start(samples), m)
     for j in range(n):
         seed, eps = past(start(samples), 4 * j), c.values[j]
         go_to(c, eps, t[j] - t[j - 1] if j > 0 else 0.0, m, seed, tol, weight)

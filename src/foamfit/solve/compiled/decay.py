@@ -9,32 +9,12 @@ from __future__ import annotations
 
 import math
 
-from foamfit.solve.compiled.along import (
-    FADING,
-    FOLLOWED,
-    SAME,
-    TABLE,
-    TOO_LONG,
-    UNFIT,
-    derive,
-    integral,
-    quartic,
-    tabulate,
-)
-from foamfit.solve.compiled.internal import toward, values_of
+from foamfit.solve.compiled import along
+from foamfit.solve.compiled.along import TABLE, derive, integral, quartic, tabulate
+from foamfit.solve.compiled.internal import direct, toward
 from foamfit.solve.compiled.motion import evaluate
-from foamfit.solve.compiled.run import unpack
-from foamfit.springs.compiled.contract import (
-    ALONG_B,
-    DIRECTION,
-    EPS,
-    PATHS,
-    X,
-    call_evaluate,
-    inner,
-    past,
-    pointed,
-)
+from foamfit.solve.compiled.run import fading
+from foamfit.springs.compiled.contract import ALONG_B, PATHS, inner, past
 
 DEPENDS = 1e-9  # relative change of N that is not rounding
 # Rows of memory, of one number per internal variable: L; x, N and dN/dr at the start; N and dN/dr
@@ -46,33 +26,32 @@ DERIVATIVES = TABLES + 2 * TABLE
 
 
 @inner
-def _begin(c):  # type: ignore[no-untyped-def]
+def _begin(c):
     """Fill L, the derivatives of the rates of all internal variables by themselves."""
-    s, n, x, m = c.springs, c.numbers, c.numbers.internals, c.aside
+    x, m = c.numbers.internals, c.aside
     unit, out = past(m, x * FIRST_X), past(m, x * TABLES)
     for k in range(x):
         unit[k] = 1.0
-        row, at = past(s, c.row), past(s, EPS)
-        call_evaluate(n.evaluate, row, s, at, unit, -1 + c.none, DIRECTION, out)
+        direct(c, c.none, unit, -1 + c.none, out)
         m[x * RATE + k], unit[k] = out[2 + x + k], 0.0
 
 
 @inner
-def _force(c, step, to):  # type: ignore[no-untyped-def]
+def _force(c, step, to):
     """Fill N and dN/dr at a point."""
-    s, x, m, values = c.springs, c.numbers.internals, c.aside, values_of(c, c.none)
+    s, x, m, values = c.springs, c.numbers.internals, c.aside, c.springs.by
     for k in range(x):
-        m[x * to + k] = values[2 + x + k] - m[x * RATE + k] * s[X + k]
+        m[x * to + k] = values[2 + x + k] - m[x * RATE + k] * s.xs[k]
         m[x * (to + 1) + k] = values[4 + 3 * x + k] * step
         m[x * SIZE + k] = max(m[x * SIZE + k], abs(m[x * to + k]))
 
 
 @inner
-def _is_other(c, to):  # type: ignore[no-untyped-def]
+def _is_other(c, to):
     """Whether N is not what it was with other internal variables."""
-    s, x, m, values = c.springs, c.numbers.internals, c.aside, values_of(c, c.none)
+    s, x, m, values = c.springs, c.numbers.internals, c.aside, c.springs.by
     for k in range(x):
-        part = m[x * RATE + k] * s[X + k]
+        part = m[x * RATE + k] * s.xs[k]
         miss = abs(values[2 + x + k] - part - m[x * to + k])
         if not miss <= DEPENDS * (m[x * SIZE + k] + abs(part)):
             return True
@@ -80,24 +59,24 @@ def _is_other(c, to):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _put(c, eps, at, want):  # type: ignore[no-untyped-def]
+def _put(c, eps, at, want):
     """Bring the spring to a strain and internal variables."""
     s, n, x = c.springs, c.numbers, c.numbers.internals
     s.eps = eps
     for k in range(x):
-        s[X + k] = c.y[n.x_at + k] = c.aside[x * at + k]
+        s.xs[k] = c.y[n.x_at + k] = c.aside[x * at + k]
     evaluate(c, c.none, want)
 
 
 @inner
-def _slope(c, step, h):  # type: ignore[no-untyped-def]
+def _slope(c, step, h):
     """Return dσ/dr at a point evaluated with `want` = PATHS."""
     size = 2 + 2 * c.numbers.internals
-    return c.springs.slope * step + values_of(c, c.none)[ALONG_B * size] * h
+    return c.springs.slope * step + c.springs.by[ALONG_B * size] * h
 
 
 @inner
-def _respond(c, h, tol):  # type: ignore[no-untyped-def]
+def _respond(c, h, tol):
     """Fill the internal variables in the middle and at the end; false if a step is too long."""
     x, m, fine = c.numbers.internals, c.aside, True
     for k in range(x):
@@ -117,7 +96,7 @@ def _respond(c, h, tol):  # type: ignore[no-untyped-def]
         m[x * HALF_X + k] = math.exp(-0.5 * fade) * before + 0.5 * h * part
         m[x * LAST_X + k] = math.exp(-fade) * before + h * whole
         size = max(m[x * LARGEST + k], abs(m[x * LAST_X + k]))
-        fine = fine and not FOLLOWED * h * table[0] * abs(bump) > tol * size
+        fine = fine and not along.FOLLOWED * h * table[0] * abs(bump) > tol * size
         if fine:
             m[x * LARGEST + k] = size
     return fine
@@ -127,9 +106,9 @@ def _respond(c, h, tol):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _change(c, seed, to):  # type: ignore[no-untyped-def]
+def _change(c, seed, to):
     """Fill the derivatives of N at a point, `to` 1 (start), 2 (middle) or 3 (end)."""
-    x, m, p, values = c.numbers.internals, c.aside, c.p, values_of(c, c.none)
+    x, m, p, values = c.numbers.internals, c.aside, c.p, c.springs.by
     derive(c, seed)
     rows = past(m, x * DERIVATIVES)
     for j in range(p):
@@ -140,7 +119,7 @@ def _change(c, seed, to):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _move(c, h, whole):  # type: ignore[no-untyped-def]
+def _move(c, h, whole):
     """Fill the derivatives of the internal variables at the end of a step, or in its middle."""
     x, m, p, n = c.numbers.internals, c.aside, c.p, c.numbers
     rows, long = past(m, x * DERIVATIVES), 1.0 if whole else 0.5
@@ -157,7 +136,7 @@ def _move(c, h, whole):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _keep(c, seed, h):  # type: ignore[no-untyped-def]
+def _keep(c, seed, h):
     """Keep the start of a step, or return to it if h is negative."""
     x, m, p, y, n = c.numbers.internals, c.aside, c.p, c.y, c.numbers
     rows, mine = past(m, x * DERIVATIVES), c.base + n.x_at * p
@@ -167,28 +146,27 @@ def _keep(c, seed, h):  # type: ignore[no-untyped-def]
         else:
             rows[k] = y[mine + k]
     for k in range(x if h >= 0.0 else c.none):
-        m[x * FIRST_X + k] = c.springs[X + k]
+        m[x * FIRST_X + k] = c.springs.xs[k]
     if h >= 0.0 and p > 0:
         _change(c, seed, 1)
 
 
-@pointed(FADING)
-def fade(words, part, h, tol, seed, room):  # type: ignore[no-untyped-def]
+@fading
+def fade(c, part, h, tol, seed, room):
     """Step to a strain within h; begin a run if h is zero, go back a step if it is negative.
 
     `room` becomes the stress in the middle of the step, its slopes at both ends, and its
     derivatives in the middle.
     """
-    c = unpack(words)
     s, want = c.springs, PATHS if c.terms > 0 else c.none
     if h == 0.0:
         _begin(c)
-        return SAME + c.none
+        return along.SAME + c.none
     if h < 0.0:
         _keep(c, seed, h)
         _put(c, part, FIRST_X, want)
         derive(c, seed)
-        return SAME + c.none
+        return along.SAME + c.none
     origin, step = s.eps, part - s.eps
     evaluate(c, c.none, want)
     room[1] = _slope(c, step, h)
@@ -201,7 +179,7 @@ def fade(words, part, h, tol, seed, room):  # type: ignore[no-untyped-def]
     if not _respond(c, h, tol):
         _put(c, origin, FIRST_X, want)
         derive(c, seed)
-        return TOO_LONG + c.none
+        return along.TOO_LONG + c.none
     if c.p > 0:
         _put(c, part, LAST_X, c.none)
         _change(c, seed, 3)
@@ -215,8 +193,8 @@ def fade(words, part, h, tol, seed, room):  # type: ignore[no-untyped-def]
             room[3 + j] = c.common[j]
     _put(c, part, LAST_X, want)
     if other or _is_other(c, LAST):
-        return UNFIT + c.none
+        return along.UNFIT + c.none
     _move(c, h, 1 + c.none)
     derive(c, seed)
     room[2] = _slope(c, step, h)
-    return SAME + c.none
+    return along.SAME + c.none

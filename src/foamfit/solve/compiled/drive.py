@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-from foamfit.solve.compiled.motion import (
-    BEGIN_RAMP,
-    END_RAMP,
-    ONLY_DERIVATIVES,
-    call_inside,
-    evaluate,
-    in_contact,
-    rates,
-    rates_of,
-)
-from foamfit.solve.compiled.run import numbers, spring, sum_gain, unpack
-from foamfit.solve.compiled.samples import KNOWN, row_of, write
+from foamfit.solve.compiled import motion
+from foamfit.solve.compiled.motion import evaluate, in_contact, rates, rates_of
+from foamfit.solve.compiled.run import call_inside, driving, numbers, spring, sum_gain, write
+from foamfit.solve.compiled.samples import KNOWN, row_of
 from foamfit.solve.compiled.static import bring, push_to
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
-from foamfit.springs.compiled.contract import (
-    BY_STRESS,
-    INTERNAL,
-    WHOLE,
-    WHOLES_AT,
-    inner,
-    past,
-    pointed,
-)
+from foamfit.springs.compiled.contract import inner, past
 
 
 @inner
-def _begin_piece(c, k):  # type: ignore[no-untyped-def]
+def _begin_piece(c, k):
     """Prescribe the drive between samples k and k + 1."""
     r, drive, t, values = c.now, c.drive, c.time, c.values
     r.now, r.begun, drive.value, drive.value_rate = 0.0, t[k], values[k], 0.0
@@ -40,24 +24,22 @@ def _begin_piece(c, k):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _starts_on_ramp(c):  # type: ignore[no-untyped-def]
+def _starts_on_ramp(c):
     """Whether internal variables change up to the first sample of a drive."""
-    if c.values[0] == 0.0 or not (c.top == MOTION or c.top == STRESS):
-        return False
-    for i in range(c.ends[c.groups - 2] if c.groups > 1 else c.none, c.count):
-        if numbers(c, i).kind == INTERNAL:
-            return True
-    return False
+    internal = 0
+    for i in range(c.first[c.groups - 1], c.count):
+        internal += numbers(c, i).internal
+    return internal > 0 and c.values[0] != 0.0 and (c.top == MOTION or c.top == STRESS)
 
 
 @inner
-def _start(c):  # type: ignore[no-untyped-def]
+def _start(c):
     """Bring the springs above the last mass into equilibrium with the first sample of a drive.
 
     Under a prescribed stress, springs with a dashpot start from rest.
     """
     g, y = c.groups - 1, c.y
-    i0, i1 = (c.ends[g - 1] if g > 0 else c.none), c.ends[g]
+    i0, i1 = c.first[g], c.first[g + 1]
     _begin_piece(c, c.none)
     first = c.drive.value
     if c.top == FREE or c.top == VISCOUS:
@@ -76,7 +58,7 @@ def _start(c):  # type: ignore[no-untyped-def]
         s.tangent, s.total = s.slope, s.sigma
         if n.eps_at >= 0:
             y[n.eps_at] = s.eps
-        if n.kind == BY_STRESS and n.x_at >= 0:
+        if n.by_stress and n.x_at >= 0:
             y[n.x_at] = s.x
         for k in range(c.terms):
             y[n.z_at + k] = -s.total
@@ -87,7 +69,7 @@ def _start(c):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _derive_start(c, g, i0, i1, common):  # type: ignore[no-untyped-def]
+def _derive_start(c, g, i0, i1, common):
     """Fill the derivatives of the state at rest, where relaxation terms carry nothing.
 
     A prescribed motion has moved the springs before their dashpots carry anything.
@@ -98,7 +80,7 @@ def _derive_start(c, g, i0, i1, common):  # type: ignore[no-untyped-def]
         s = spring(c, i)
         s.offset = s.eta
         s.eta = 0.0 if c.top == MOTION else s.eta
-    rates_of(c, g, y, c.f, ONLY_DERIVATIVES, 0.0)
+    rates_of(c, g, y, c.f, motion.ONLY_DERIVATIVES, 0.0)
     for i in range(i0, i1):
         s, n, strain = spring(c, i), numbers(c, i), past(c.strain, i * p)
         s.eta, s.offset = s.offset, 0.0
@@ -113,7 +95,7 @@ def _derive_start(c, g, i0, i1, common):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _is_damped(c):  # type: ignore[no-untyped-def]
+def _is_damped(c):
     """Whether the stress of a spring depends on its strain rate."""
     damped = False
     for i in range(c.count):
@@ -123,14 +105,14 @@ def _is_damped(c):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _next_piece(c, want):  # type: ignore[no-untyped-def]
+def _next_piece(c, want):
     """Write the sample at the end of a piece, and begin the next; return whether it was the last.
 
     Dashpots have the mean rate at a sample where the prescribed rate jumps.
     """
     r, k, t = c.now, int(c.now.piece) + 1, c.time
     if k == 0:  # after a ramp
-        call_inside(c, END_RAMP, c.none, want, c.y, c.stage, c.y, c.y)
+        call_inside(c, motion.END_RAMP, c.none, want, c.y, c.stage, c.y, c.y)
         _begin_piece(c, k)
     r.piece, jumps = k, k > 0 and c.top == MOTION and c.groups == 1 and _is_damped(c)
     if jumps or k == c.samples - 1:
@@ -151,14 +133,13 @@ def _next_piece(c, want):  # type: ignore[no-untyped-def]
     return c.none
 
 
-@pointed(WHOLE(WHOLES_AT, WHOLE, WHOLE))
-def next_piece(words, starts, want):  # type: ignore[no-untyped-def]
+@driving
+def next_piece(c, starts, want):
     """Start from rest, or begin the next piece; return whether all samples are written."""
-    c = unpack(words)
     if not starts:
         return _next_piece(c, want)
     if _starts_on_ramp(c):
-        call_inside(c, BEGIN_RAMP, c.none, want, c.y, c.stage, c.y, c.y)
+        call_inside(c, motion.BEGIN_RAMP, c.none, want, c.y, c.stage, c.y, c.y)
         return c.none
     _start(c)
     rates(c, c.y, c.stage, want, 0.0)

@@ -5,29 +5,10 @@ Events are found on the dense output of a step.
 
 from __future__ import annotations
 
-from numba import types
-
-from foamfit.solve.compiled.motion import JUMP, call_inside, look
-from foamfit.solve.compiled.run import RECORD, numbers, spring, unpack
-from foamfit.springs.compiled.contract import (
-    BY,
-    EXPLICIT,
-    INTERNAL,
-    OF_HELD,
-    OF_PARAMETER,
-    OF_STRESS,
-    REAL,
-    REALS_AT,
-    RESULTS,
-    WHOLE,
-    WHOLES_AT,
-    call_switch,
-    calling,
-    inlined,
-    inner,
-    past,
-    pointed,
-)
+from foamfit.solve.compiled.motion import JUMP, look
+from foamfit.solve.compiled.run import call_inside, entering, numbers, spring
+from foamfit.springs.compiled import contract
+from foamfit.springs.compiled.contract import OF_HELD, OF_PARAMETER, OF_STRESS, inner, past
 from foamfit.springs.laws.record import OWN_ETA
 
 ROUNDED = 1e-12  # strain past an end that rounding explains, of a spring that moves away from it
@@ -40,24 +21,22 @@ NOWHERE = 2.0  # instead of a share of a step
 # greatest and a least strain.
 TOP_END, LOW_END, TURN, RELEASE, TOP_TURN, LOW_TURN = range(6)
 PLAIN, SAMPLED, DOUBTFUL, FAILED = range(4)  # ends of an attempted step
-#: record, whether with derivatives, tolerance, time of the next sample, bound on steps
-STEPPING = WHOLE(WHOLES_AT, WHOLE, REAL, REAL, REAL)
-call_step = calling(WHOLE, RECORD, WHOLE, REAL, REAL, REAL)
 
 
-@pointed(types.void(WHOLES_AT, WHOLE, WHOLE, REALS_AT))
-def enter_branch(words, i, up, y):  # type: ignore[no-untyped-def]
-    """Leave the branch of a spring at its upper or lower end, and enter the next."""
-    c = unpack(words)
+@entering
+def enter_branch(c, i, up, y):
+    """Leave the branch of a spring at its upper or lower end, and enter the next.
+
+    The derivatives of its held numbers change as well.
+    """
     s, n, p = spring(c, i), numbers(c, i), c.p
-    out, kind, directions = past(s, RESULTS), n.kind, c.directions
-    slope = s.slope
-    changes = past(out, BY + n.parameters)  # no derivatives of a BY_STRESS law
-    if kind == INTERNAL:
+    directions, slope = c.directions, s.slope
+    changes = past(s.by, n.parameters)  # no derivatives of a BY_STRESS law
+    if n.internal:
         call_inside(c, JUMP, i, up, y, y, y, y)
         return
-    call_switch(n.switch, past(s, c.row), s, up, changes)
-    if kind == EXPLICIT:
+    contract.call_switch(n.switch, past(s, c.row), s, up, changes)
+    if not n.by_stress:
         return
     if not c.solved and n.x_at >= 0:
         y[n.x_at] = s.x
@@ -73,20 +52,11 @@ def enter_branch(words, i, up, y):  # type: ignore[no-untyped-def]
             held[h * p + j] = value
 
 
-_call_change = calling(types.void, RECORD, WHOLE, WHOLE, REALS_AT)
-
-
-@inlined
-def change_branch(c, i, up, y):  # type: ignore[no-untyped-def]
-    """Change the branch of a spring, and the derivatives of its held numbers."""
-    _call_change(c.change_at, c, i, up, y)
-
-
 # ---------------------------------------------------------------- along a step
 
 
 @inner
-def _excess(c, i, kind):  # type: ignore[no-untyped-def]
+def _excess(c, i, kind):
     """Return how far a spring is past the end of its branch, or the contact past its own."""
     s = spring(c, i)
     if kind == RELEASE:
@@ -97,7 +67,7 @@ def _excess(c, i, kind):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _happened(c, i, kind):  # type: ignore[no-untyped-def]
+def _happened(c, i, kind):
     """Whether a spring is past an end or has turned, and not by rounding while it moves away."""
     over, rate = _excess(c, i, kind), spring(c, i).rate
     leaves = kind < TURN and over < ROUNDED and (rate < 0.0) == (kind == TOP_END)
@@ -105,7 +75,7 @@ def _happened(c, i, kind):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _root(c, low, high, i, kind):  # type: ignore[no-untyped-def]
+def _root(c, low, high, i, kind):
     """Return where an excess becomes positive between two shares, by Illinois' method."""
     look(c, low)
     f_low = _excess(c, i, kind)
@@ -135,7 +105,7 @@ def _root(c, low, high, i, kind):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _locate(c, low, high, i, kind):  # type: ignore[no-untyped-def]
+def _locate(c, low, high, i, kind):
     """Return where an excess becomes positive between two shares.
 
     A spring that begins at an end of its branch may be past it by rounding and yet move away from
@@ -157,7 +127,7 @@ def _locate(c, low, high, i, kind):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _earliest(c, before, share):  # type: ignore[no-untyped-def]
+def _earliest(c, before, share):
     """Return the first of the events in (before, share] whose effect is seen at the end."""
     found, who, what = share, -1 + c.none, -1 + c.none
     look(c, found)
@@ -179,7 +149,7 @@ def _earliest(c, before, share):  # type: ignore[no-untyped-def]
 
 
 @inner
-def first_event(c):  # type: ignore[no-untyped-def]
+def first_event(c):
     """Return where in a step its first event is, of which spring (-1: no event) and of which kind.
 
     A spring may go past the end of its branch and return within the step, or turn twice. So the
@@ -223,7 +193,7 @@ def first_event(c):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _may_pass(s, dt):  # type: ignore[no-untyped-def]
+def _may_pass(s, dt):
     """Whether an extremum since the old strain may lie past an end of the branch."""
     if not s.old_rate * s.rate < 0.0:
         return False
@@ -232,7 +202,7 @@ def _may_pass(s, dt):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _vertex(low, f_low, middle, f_middle, high, f_high):  # type: ignore[no-untyped-def]
+def _vertex(low, f_low, middle, f_middle, high, f_high):
     """Return where the parabola through three points is least, and its value there."""
     first = (f_middle - f_low) / (middle - low)
     bend = ((f_high - f_middle) / (high - middle) - first) / (high - low)
@@ -243,7 +213,7 @@ def _vertex(low, f_low, middle, f_middle, high, f_high):  # type: ignore[no-unty
 
 
 @inner
-def _may_dip(s):  # type: ignore[no-untyped-def]
+def _may_dip(s):
     """Return the share of a step at which a spring may move against its branch; else NOWHERE.
 
     Its rate has the sign of the branch at both ends of the step.
@@ -256,7 +226,7 @@ def _may_dip(s):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _turned(c, i, x):  # type: ignore[no-untyped-def]
+def _turned(c, i, x):
     """Return a share of the step at which a spring moves against its branch, from a guess x."""
     s, low, high = spring(c, i), 0.0, 1.0
     way = s.turns
@@ -284,7 +254,7 @@ def _turned(c, i, x):  # type: ignore[no-untyped-def]
 
 
 @inner
-def keep_midway(c):  # type: ignore[no-untyped-def]
+def keep_midway(c):
     """Keep the strain rates about the middle of a step."""
     for i in range(c.count):
         s = spring(c, i)
@@ -292,7 +262,7 @@ def keep_midway(c):  # type: ignore[no-untyped-def]
 
 
 @inner
-def suspicious(c, dt):  # type: ignore[no-untyped-def]
+def suspicious(c, dt):
     """Whether a step may contain an event, by the values at both ends."""
     if c.now.pressed > 0.0 and c.carried[0] <= 0.0:
         return True
@@ -306,7 +276,7 @@ def suspicious(c, dt):  # type: ignore[no-untyped-def]
 
 
 @inner
-def keep_values(c):  # type: ignore[no-untyped-def]
+def keep_values(c):
     """Keep strains and rates of the beginning of a step, and the largest stress."""
     largest = c.now.largest
     for i in range(c.count):

@@ -14,23 +14,10 @@ import math
 import numpy as np
 from scipy.integrate._ivp import dop853_coefficients as pair
 
-from foamfit.solve.compiled.events import (
-    DOUBTFUL,
-    FAILED,
-    MIDDLE,
-    PLAIN,
-    SAMPLED,
-    STEPPING,
-    keep_midway,
-    suspicious,
-)
+from foamfit.solve.compiled import events
 from foamfit.solve.compiled.motion import rates
-from foamfit.solve.compiled.run import RECORD, STEPPED, unpack
-from foamfit.springs.compiled.contract import REAL, WHOLE, WHOLES_AT, calling, inner, past, pointed
-
-#: record, whether with derivatives, tolerance; returns 1 if the step was taken
-SHORTENING = WHOLE(WHOLES_AT, WHOLE, REAL)
-call_short = calling(WHOLE, RECORD, WHOLE, REAL)
+from foamfit.solve.compiled.run import STEPPED, call_short, stepping
+from foamfit.springs.compiled.contract import inner, past
 
 ALL_STAGES = 16  # those of a step and of the dense output
 _A = np.zeros((ALL_STAGES, ALL_STAGES))
@@ -53,14 +40,14 @@ WEIGHT = np.concatenate(
      for full, row, more in zip(_FULL, _ROWS, NONE, strict=True)]
 )  # fmt: skip
 TIMES = pair.C[:ALL_STAGES]
-MIDWAY_STAGE = int(np.flatnonzero(TIMES == MIDDLE)[0])
+MIDWAY_STAGE = int(np.flatnonzero(TIMES == events.MIDDLE)[0])
 
 LAST_TERM = 3e-4  # share of the last term of the dense output that counts as its error
 AIMED = 0.77  # growth of a step whose dense output has an error of 1; few steps are then repeated
 
 
 @inner
-def combine(c, n, row, scale, begin, out):  # type: ignore[no-untyped-def]
+def combine(c, n, row, scale, begin, out):
     """Fill out = begin + scale Σ WEIGHT[k] stage[FROM[k]] of a row of coefficients."""
     first, last, stage, wide = FIRST[row], FIRST[row + 1], c.stage, c.wide
     if n <= 8:
@@ -89,7 +76,7 @@ def combine(c, n, row, scale, begin, out):  # type: ignore[no-untyped-def]
 
 
 @inner
-def take(c, n, dt, at, want):  # type: ignore[no-untyped-def]
+def take(c, n, dt, at, want):
     """Fill the stages of a step from the first, and the state and rates at its end."""
     for s in range(1, STEPPED + 1):
         target = c.new if s == STEPPED else c.state
@@ -97,11 +84,11 @@ def take(c, n, dt, at, want):  # type: ignore[no-untyped-def]
         when = at + TIMES[s] * dt if s < STEPPED else at + dt
         rates(c, target, past(c.stage, s * c.wide), want, when)
         if s == MIDWAY_STAGE:
-            keep_midway(c)
+            events.keep_midway(c)
 
 
 @inner
-def error_of(c, dt, tol):  # type: ignore[no-untyped-def]
+def error_of(c, dt, tol):
     """Return the error of a step over the tolerance."""
     y, new, kinds, scales, errors, wide = c.y, c.new, c.kinds, c.scales, c.errors, c.wide
     for q in range(2):
@@ -119,7 +106,7 @@ def error_of(c, dt, tol):  # type: ignore[no-untyped-def]
 
 
 @inner
-def make_dense(c, n, dt, at, tol, want):  # type: ignore[no-untyped-def]
+def make_dense(c, n, dt, at, tol, want):
     """Fill the dense output of a step; return the size of its last term over the tolerance.
 
     Where fast processes have died out, that exceeds the error at the end of the step by far.
@@ -142,21 +129,20 @@ def make_dense(c, n, dt, at, tol, want):  # type: ignore[no-untyped-def]
     return LAST_TERM / tol * size
 
 
-@pointed(STEPPING)
-def step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
+@stepping
+def step(c, want, tol, upto, most):
     """Take one step, shorter ones until it is accurate; return how it ended.
 
     `upto` is the time of the next sample inside the piece. A step that may contain a switch or
     contains a sample has its dense output.
     """
-    c = unpack(words)
     r, again, n = c.now, False, c.base + c.carries * c.p
-    if c.short_at and call_short(c.short_at, c, want, tol):
-        return PLAIN + c.none
+    if c.short_at and call_short(c, want, tol):
+        return events.PLAIN + c.none
     while True:
         dt, at = r.step, r.now
         if r.now + dt == r.now or not dt > 0.0:
-            return FAILED
+            return events.FAILED
         take(c, n, dt, at, want)
         r.taken += 1.0
         error = error_of(c, dt, tol)
@@ -164,16 +150,16 @@ def step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
             again = True
             r.step = dt * (max(0.2, 0.9 * error**-0.125) if error < math.inf else 0.2)
             if r.taken >= most:
-                return FAILED
+                return events.FAILED
             continue
         grow = 6.0
         if error > 1e-8:
             grow = min(6.0, max(0.3, 0.9 * error**-0.115 * r.last**0.02))
         r.grow = min(grow, 1.0) if again else grow
-        doubtful = suspicious(c, dt)
+        doubtful = events.suspicious(c, dt)
         if not doubtful and upto > r.now + dt:
             r.last = max(error, 1e-4)
-            return PLAIN
+            return events.PLAIN
         size = make_dense(c, n, dt, at, tol, want)
         if size > 1.0 and dt > 1e-12 * abs(r.horizon):
             again = True
@@ -182,4 +168,4 @@ def step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
         r.last = max(error, 1e-4)
         if size > 0.0:
             r.grow = min(r.grow, AIMED * size**-0.143)
-        return DOUBTFUL if doubtful else SAMPLED
+        return events.DOUBTFUL if doubtful else events.SAMPLED

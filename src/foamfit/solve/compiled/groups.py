@@ -12,33 +12,20 @@ from __future__ import annotations
 
 import math
 
-from foamfit.solve.compiled.motion import (
-    GROUP,
-    LOSE,
-    LOSSES,
-    ONLY_DERIVATIVES,
-    SHARE,
-    call_inside,
-    derive_inside,
-    derive_spring,
-    follow_spring,
-    move_inside,
-    span_of,
-    span_tangents,
-)
-from foamfit.solve.compiled.run import numbers, spring, unpack
+from foamfit.solve.compiled import motion
+from foamfit.solve.compiled.run import call_inside, grouping, numbers, spring
 from foamfit.solve.compiled.static import put, root, strain_at
 from foamfit.solve.scene import STRESS, VISCOUS
-from foamfit.springs.compiled.contract import INTERNAL, RELAX, X, inner, past, pointed
+from foamfit.springs.compiled.contract import inner, past
 
 MOVES = 1e-9  # relative difference of stresses that is more than rounding
 
 
 @inner
-def _follow(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
+def _follow(c, g, y, f, want, at):
     """Fill the values of the springs of a group and their part of the rates `f`."""
-    i0, i1 = (c.ends[g - 1] if g > 0 else 0), c.ends[g]
-    reach, rate = span_of(c, g, y, at)
+    i0, i1 = c.first[g], c.first[g + 1]
+    reach, rate = motion.span_of(c, g, y, at)
     last = g == c.groups - 1
     push = c.drive.value + c.drive.value_rate * at
     weight, total, pull, loose, flat, lossy = 0.0, rate, -rate, -1, -1, False
@@ -47,7 +34,7 @@ def _follow(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
     for i in range(i0, i1):
         s, n = spring(c, i), numbers(c, i)
         eps = y[n.eps_at] if s.eta > 0.0 or not c.solved else s.eps
-        h, eta, stress = s.height, s.eta, follow_spring(c, i, eps, y, f, want)
+        h, eta, stress = s.height, s.eta, motion.follow_spring(c, i, eps, y, f, want)
         if eta > 0.0:
             weight += h / eta
             total += h / eta * stress
@@ -63,7 +50,7 @@ def _follow(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
         common = spring(c, loose if flat < 0 else flat).total
     elif lossy:
         c.drive.push, c.drive.spread = push, rate
-        call_inside(c, SHARE, g, want, y, f, y, y)
+        call_inside(c, motion.SHARE, g, want, y, f, y, y)
         common = c.carried[g]
     elif last and c.top == VISCOUS:  # without the difference of S and push, which may be tiny
         common = push - c.drive.dragged * pull / (c.drive.dragged * weight + 1.0)
@@ -82,11 +69,11 @@ def _follow(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
         s = spring(c, i)
         if s.eta > 0.0 or not c.solved:
             f[numbers(c, i).eps_at] = s.rate
-        move_inside(c, i, f)
+        motion.move_inside(c, i, f)
 
 
 @inner
-def solve_loose(c, g, i0, i1, reach, push, y):  # type: ignore[no-untyped-def]
+def solve_loose(c, g, i0, i1, reach, push, y):
     """Fill the strains of the springs without a dashpot on their branches."""
     flat, rest, some = -1, reach, False
     common = c.carried[g] if abs(c.carried[g]) < math.inf else 0.0  # after a trial that failed
@@ -94,14 +81,14 @@ def solve_loose(c, g, i0, i1, reach, push, y):  # type: ignore[no-untyped-def]
         s, n = spring(c, i), numbers(c, i)
         s.offset = 0.0
         for k in range(c.terms):
-            s.offset += s[RELAX + 2 * k] * y[n.z_at + k]
+            s.offset += s.g[k] * y[n.z_at + k]
         if s.eta > 0.0:
             rest -= s.height * y[n.eps_at]
             continue
         some = True
-        if n.kind == INTERNAL:
+        if n.internal:
             for k in range(n.internals):
-                s[X + k] = y[n.x_at + k]
+                s.xs[k] = y[n.x_at + k]
         if s.sigma_low == s.sigma_high:
             flat = i
     if not some:
@@ -125,7 +112,7 @@ def solve_loose(c, g, i0, i1, reach, push, y):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _close(c, i0, i1, rest, pushed):  # type: ignore[no-untyped-def]
+def _close(c, i0, i1, rest):
     """Give what rounding leaves of the rate of elongation to the spring with the lightest dashpot.
 
     Rounding errors of S - T over a light dashpot would change the elongation, and nothing resists.
@@ -135,13 +122,12 @@ def _close(c, i0, i1, rest, pushed):  # type: ignore[no-untyped-def]
         s = spring(c, i)
         if s.loss < least * s.height:
             least, where = s.loss / s.height, i
-    if not pushed:
-        s = spring(c, where)
-        s.rate += rest / s.height
+    s = spring(c, where)
+    s.rate += rest / s.height
 
 
 @inner
-def share_rate(c, g, i0, i1, rate, loose, flat, pushed, lossy):  # type: ignore[no-untyped-def]
+def share_rate(c, g, i0, i1, rate, loose, flat, pushed, lossy):
     """Fill the strain rates of a group of several springs; `pushed`: its stress is prescribed.
 
     `lossy`: a stress of its springs depends on the strain rate, besides that of dashpots.
@@ -151,7 +137,7 @@ def share_rate(c, g, i0, i1, rate, loose, flat, pushed, lossy):  # type: ignore[
         s = spring(c, i)
         if s.eta > 0.0:
             if lossy and s.lossy > 0.0:
-                call_inside(c, LOSE, i, g, c.y, c.f, c.y, c.y)
+                call_inside(c, motion.LOSE, i, g, c.y, c.f, c.y, c.y)
             else:
                 s.rate = (common - s.total) / s.eta
             rest -= s.height * s.rate
@@ -160,7 +146,8 @@ def share_rate(c, g, i0, i1, rate, loose, flat, pushed, lossy):  # type: ignore[
             soft += compliance
             rest += compliance * s.drift
     if loose < 0:
-        _close(c, i0, i1, rest if not pushed else 0.0, pushed)
+        if not pushed:
+            _close(c, i0, i1, rest)
         return
     if not pushed and flat < 0:
         climb = rest / soft
@@ -185,12 +172,12 @@ def share_rate(c, g, i0, i1, rate, loose, flat, pushed, lossy):  # type: ignore[
 
 
 @inner
-def derive_group(c, g, y, f):  # type: ignore[no-untyped-def]
+def derive_group(c, g, y, f):
     """Fill the derivatives of the stress of a group, and of the rates of its springs."""
-    i0, i1, p = (c.ends[g - 1] if g > 0 else 0), c.ends[g], c.p
+    i0, i1, p = c.first[g], c.first[g + 1], c.p
     out = past(c.common, g * p)
     reach, rate = past(c.common, (c.groups + 1) * p), past(c.common, (c.groups + 2) * p)
-    span_tangents(c, g, y, reach, rate)
+    motion.span_tangents(c, g, y, reach, rate)
     loose, soft, weight, flat = -1, 0.0, 0.0, -1
     last = g == c.groups - 1
     for i in range(i0, i1):
@@ -204,7 +191,7 @@ def derive_group(c, g, y, f):  # type: ignore[no-untyped-def]
         else:
             soft += s.height / (s.gain * s.tangent)
     for i in range(i0, i1):  # of damped springs `total` becomes the whole derivative
-        derive_spring(c, i, y)
+        motion.derive_spring(c, i, y)
         s, own, total = spring(c, i), past(c.own, 2 * i * p), past(c.part, (c.count + i) * p)
         slope, at, share = s.gain * s.steep, numbers(c, i).eps_at, 0.0
         if s.eta > 0.0:
@@ -212,7 +199,7 @@ def derive_group(c, g, y, f):  # type: ignore[no-untyped-def]
             for j in range(p):
                 total[j] += slope * y[c.base + at * p + j]
             if s.lossy > 0.0:
-                call_inside(c, LOSSES, i, c.none, y, f, y, total)
+                call_inside(c, motion.LOSSES, i, c.none, y, f, y, total)
         else:
             for j in range(p):
                 total[j] += own[p + j] * s.rate
@@ -237,7 +224,7 @@ def derive_group(c, g, y, f):  # type: ignore[no-untyped-def]
 
 
 @inner
-def derive_common(c, last, loose, flat, soft, weight, reach, rate, out):  # type: ignore[no-untyped-def]
+def derive_common(c, last, loose, flat, soft, weight, reach, rate, out):
     """Fill the derivatives of the stress of a group; see `derive_group`."""
     p, of_drag = c.p, past(c.own, 2 * c.count * c.p)
     if last and c.top == STRESS:
@@ -261,7 +248,7 @@ def derive_common(c, last, loose, flat, soft, weight, reach, rate, out):  # type
 
 
 @inner
-def derive_share(c, i, y, f, is_flat, reach, out):  # type: ignore[no-untyped-def]
+def derive_share(c, i, y, f, is_flat, reach, out):
     """Fill the derivatives of the strain of a spring in a group of several; of its rate too."""
     p, at = c.p, numbers(c, i).eps_at
     s, own, total = spring(c, i), past(c.own, 2 * i * p), past(c.part, (c.count + i) * p)
@@ -277,14 +264,13 @@ def derive_share(c, i, y, f, is_flat, reach, out):  # type: ignore[no-untyped-de
         slope = s.gain * s.steep
         for j in range(p):
             strain[j] = (out[j] - total[j]) / slope if slope > 0.0 else 0.0
-    derive_inside(c, i, y, f, past(f, mine) if s.eta > 0.0 else strain)
+    motion.derive_inside(c, i, y, f, past(f, mine) if s.eta > 0.0 else strain)
 
 
-@pointed(GROUP)
-def group_values(words, g, y, f, want, at):  # type: ignore[no-untyped-def]
+@grouping
+def group_values(c, g, y, f, want, at):
     """Fill the values of the springs of a group and their part of the rates `f`; return S."""
-    c = unpack(words)
-    if want != ONLY_DERIVATIVES:
+    if want != motion.ONLY_DERIVATIVES:
         _follow(c, g, y, f, want, at)
     if want:
         derive_group(c, g, y, f)

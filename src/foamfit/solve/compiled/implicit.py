@@ -16,18 +16,11 @@ import math
 
 import numpy as np
 
-from foamfit.solve.compiled.events import (
-    DOUBTFUL,
-    FAILED,
-    SAMPLED,
-    STEPPING,
-    keep_midway,
-    suspicious,
-)
+from foamfit.solve.compiled import events
 from foamfit.solve.compiled.motion import rates
 from foamfit.solve.compiled.rates import is_unresolved, remember, stiffness_of
-from foamfit.solve.compiled.run import OF_V, OF_W, POINTS, STEPPED, SYSTEMS, spring, unpack
-from foamfit.springs.compiled.contract import inner, past, pointed
+from foamfit.solve.compiled.run import OF_V, OF_W, POINTS, STEPPED, SYSTEMS, spring, stepping
+from foamfit.springs.compiled.contract import inner, past
 
 
 def _radau() -> tuple[np.ndarray, np.ndarray]:
@@ -75,7 +68,7 @@ ROUNDED = 1e-15  # relative error that is nothing but rounding
 
 
 @inner
-def factor(a, n, reach, pivots):  # type: ignore[no-untyped-def]
+def factor(a, n, reach, pivots):
     """Factor a banded complex matrix in place, with pivots; a[i, j - i + reach], up to 3 reach."""
     wide = 3 * reach + 1
     for k in range(n):
@@ -104,7 +97,7 @@ def factor(a, n, reach, pivots):  # type: ignore[no-untyped-def]
 
 
 @inner
-def substitute(a, n, reach, pivots, x):  # type: ignore[no-untyped-def]
+def substitute(a, n, reach, pivots, x):
     """Solve a factored system in place."""
     wide = 3 * reach + 1
     for k in range(n):
@@ -121,7 +114,7 @@ def substitute(a, n, reach, pivots, x):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _scale(c, k):  # type: ignore[no-untyped-def]
+def _scale(c, k):
     """Return the scale of a component; that of nodes is shared."""
     if k < 2 * c.nodes:
         return c.scales[OF_V if k % 2 else OF_W]
@@ -129,7 +122,7 @@ def _scale(c, k):  # type: ignore[no-untyped-def]
 
 
 @inner
-def linearise(c, at):  # type: ignore[no-untyped-def]
+def linearise(c, at):
     """Fill the derivatives of the rates by the state, by differences, in bands of 2 reach + 1."""
     places, groups_of, n, reach, jacobian = c.places, c.groups_of, c.carries, c.reach, c.jacobian
     y, f0, f1, wide = c.y, c.f, c.state, 2 * reach + 1
@@ -154,7 +147,7 @@ def linearise(c, at):  # type: ignore[no-untyped-def]
 
 
 @inner
-def prepare(c, h):  # type: ignore[no-untyped-def]
+def prepare(c, h):
     """Factor the systems of a step of length h; false if one is singular."""
     n, reach, jacobian = c.carries, c.reach, c.jacobian
     wide, narrow = 3 * reach + 1, 2 * reach + 1
@@ -173,7 +166,7 @@ def prepare(c, h):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _improve(c, h, column, tol):  # type: ignore[no-untyped-def]
+def _improve(c, h, column, tol):
     """Take one step of Newton's method for the state (column 0) or a derivative; return its size.
 
     Sizes are relative to the scales, for derivatives also to the largest value so far.
@@ -213,7 +206,7 @@ def _improve(c, h, column, tol):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _collocate(c, h, at, tol, want):  # type: ignore[no-untyped-def]
+def _collocate(c, h, at, tol, want):
     """Solve one step by Newton's method from the guess in its increments; false if it fails.
 
     The state is solved first, and from the same values of the springs whether derivatives are
@@ -237,7 +230,7 @@ def _collocate(c, h, at, tol, want):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _solve(c, h, at, tol, first, last):  # type: ignore[no-untyped-def]
+def _solve(c, h, at, tol, first, last):
     """Solve for the state (column 0) or for the derivatives (columns from 1 on)."""
     wide, before, y, state = c.wide, math.inf, c.y, c.state
     total = c.base + c.carries * c.p
@@ -248,7 +241,7 @@ def _solve(c, h, at, tol, first, last):  # type: ignore[no-untyped-def]
                 state[k] = y[k] + moves[i * wide + k]
             rates(c, state, past(c.stage, (1 + i) * wide), first, at + NODES[i] * h)
             if i == POINTS // 2:
-                keep_midway(c)
+                events.keep_midway(c)
         size = 0.0
         for column in range(first, last):
             size = max(size, _improve(c, h, column, tol))
@@ -263,16 +256,16 @@ def _solve(c, h, at, tol, first, last):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _is_lossy(c, g):  # type: ignore[no-untyped-def]
+def _is_lossy(c, g):
     """Whether a stress in a group depends on the strain rate, besides that of dashpots."""
     lossy = False
-    for i in range(c.ends[g - 1] if g > 0 else 0, c.ends[g] if g < c.groups else 0):
+    for i in range(c.first[g], c.first[min(g + 1, c.groups)]):
         lossy = lossy or spring(c, i).lossy > 0.0
     return lossy
 
 
 @inner
-def _size(c, k, old, new):  # type: ignore[no-untyped-def]
+def _size(c, k, old, new):
     """Return the size to which the error of a component is relative.
 
     Stresses depend on the velocity of a node by its dashpots: by its damping, relative to the
@@ -292,7 +285,7 @@ def _size(c, k, old, new):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _error(c, h, tol):  # type: ignore[no-untyped-def]
+def _error(c, h, tol):
     """Return the error of a step over the tolerance."""
     x, wide, n, reach = c.right, c.wide, c.carries, c.reach
     for k in range(n):
@@ -313,7 +306,7 @@ def _error(c, h, tol):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _finish(c, h, at, want):  # type: ignore[no-untyped-def]
+def _finish(c, h, at, want):
     """Fill the polynomial of a step, and state and rates at its end."""
     wide, total = c.wide, c.base + c.carries * c.p
     for q in range(POINTS):
@@ -328,7 +321,7 @@ def _finish(c, h, at, want):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _guess(c, h, last):  # type: ignore[no-untyped-def]
+def _guess(c, h, last):
     """Extrapolate the polynomial of the step before, of length `last` (0: none)."""
     wide, total = c.wide, c.base + c.carries * c.p
     for i in range(POINTS):
@@ -350,7 +343,7 @@ def _guess(c, h, last):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _allowed(c, h, excess, tol, rounded):  # type: ignore[no-untyped-def]
+def _allowed(c, h, excess, tol, rounded):
     """Return the length to use for a step with this error over the tolerance: h to accept it.
 
     An excessive error is accepted if rounding dominates it or if no shorter step is resolved.
@@ -381,17 +374,16 @@ def _allowed(c, h, excess, tol, rounded):  # type: ignore[no-untyped-def]
     return h
 
 
-@pointed(STEPPING)
-def step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
+@stepping
+def step(c, want, tol, upto, most):
     """Take one implicit step, shorter ones until it is accurate; return how it ended."""
-    c = unpack(words)
     r, at = c.now, c.now.now
     linearise(c, at)
     first, first_error = r.step, math.inf
     while True:
         h = r.step
         if r.now + h == r.now or not h > 0.0 or r.taken >= most:
-            return FAILED
+            return events.FAILED
         r.taken += 1.0
         _guess(c, h, r.before)
         solved = prepare(c, h)
@@ -410,4 +402,4 @@ def step(words, want, tol, upto, most):  # type: ignore[no-untyped-def]
     _finish(c, h, at, want)
     remember(c, h, max(upto - r.now, 0.0) if upto < math.inf else h)
     r.before = h
-    return DOUBTFUL if suspicious(c, h) else SAMPLED
+    return events.DOUBTFUL if events.suspicious(c, h) else events.SAMPLED

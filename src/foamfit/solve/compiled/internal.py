@@ -17,45 +17,12 @@ from __future__ import annotations
 
 import math
 
-from foamfit.solve.compiled.motion import (
-    BEGIN_RAMP,
-    END_RAMP,
-    FLOW,
-    FRICTION,
-    INSIDE,
-    LOSE,
-    LOSSES,
-    PART,
-    PATH,
-    SHARE,
-    evaluate,
-    in_contact,
-    rates,
-)
-from foamfit.solve.compiled.run import numbers, spring, sum_gain, unpack
+from foamfit.solve.compiled import motion
+from foamfit.solve.compiled.motion import evaluate, in_contact, rates
+from foamfit.solve.compiled.run import numbers, spring, sum_gain, working
 from foamfit.solve.scene import MOTION, VISCOUS
-from foamfit.springs.compiled.contract import (
-    ALONG_A,
-    ALONG_B,
-    BY,
-    BY_RATE,
-    DERIVED,
-    DIRECTION,
-    EPS,
-    INTERNAL,
-    PATHS,
-    RELAX,
-    RESULTS,
-    X,
-    call_evaluate,
-    call_switch,
-    changes_of,
-    inlined,
-    inner,
-    last_point,
-    past,
-    pointed,
-)
+from foamfit.springs.compiled import contract
+from foamfit.springs.compiled.contract import ALONG_A, ALONG_B, BY_RATE, inner, past
 from foamfit.springs.laws.record import OWN_ETA
 
 LEAST_RATE = 1e-25  # smaller strain rates are zero, 1/s
@@ -64,24 +31,25 @@ ENOUGH = 2e-15  # relative change of a rate or stress that ends Newton's method
 RAMP = 1e-9  # time of a ramp to the first sample over the duration
 
 
-@inlined
-def values_of(c, i):  # type: ignore[no-untyped-def]
-    """Return the results of the law of a spring."""
-    return past(spring(c, i), RESULTS + BY)
-
-
-@inlined
-def toward(c, i, j):  # type: ignore[no-untyped-def]
+@contract.inlined
+def toward(c, i, j):
     """Return the derivatives of σ, V, A and B at fixed strain in a direction, and its dx."""
     n, x = numbers(c, i), numbers(c, i).internals
-    changes = changes_of(values_of(c, i), x)
+    changes = contract.changes_of(spring(c, i).by, x)
     return past(changes, (x + 1) * (1 + x + n.parameters) + j * (2 + 3 * x))
 
 
 @inner
-def _path(c, i):  # type: ignore[no-untyped-def]
+def direct(c, i, change, own, out):
+    """Fill the derivatives of σ, V, A and B by dx and, unless negative, parameter `own`."""
+    s, law, want = spring(c, i), numbers(c, i).evaluate, contract.DIRECTION
+    contract.call_evaluate(law, past(s, c.row), s, s.point, change, own, want, out)
+
+
+@inner
+def _path(c, i):
     """Fill dσ/dε along the path of the internal variables, and what their rates B add to dT/dt."""
-    s, values, size = spring(c, i), values_of(c, i), 2 + 2 * numbers(c, i).internals
+    s, values, size = spring(c, i), spring(c, i).by, 2 + 2 * numbers(c, i).internals
     s.tangent = s.slope + values[ALONG_A * size]
     s.drift = c.drive.pace * s.gain * values[ALONG_B * size]
 
@@ -90,13 +58,13 @@ def _path(c, i):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _part(c, i, y, part):  # type: ignore[no-untyped-def]
+def _part(c, i, y, part):
     """Fill the derivatives at fixed strain, by direction, and those of the stress."""
-    s, n, p, x = spring(c, i), numbers(c, i), c.p, numbers(c, i).internals
-    evaluate(c, i, PATHS if n.fixed else 1)  # at the strain rate found since
-    last = last_point(values_of(c, i), x)
+    n, p, x = numbers(c, i), c.p, numbers(c, i).internals
+    evaluate(c, i, contract.PATHS if n.fixed else 1)  # at the strain rate found since
+    last = contract.last_point(spring(c, i).by, x)
     for j in range(p):
-        out, fresh = toward(c, i, j), last[DERIVED] == 0.0
+        out, fresh = toward(c, i, j), last.derived == 0.0
         change, own = past(out, 2 + 2 * x), c.directions[2 * j + 1]
         for k in range(x):
             value = y[c.base + (n.x_at + k) * p + j]
@@ -104,17 +72,16 @@ def _part(c, i, y, part):  # type: ignore[no-untyped-def]
             change[k] = value
         if fresh:
             own = own if c.directions[2 * j] == i and 0 <= own < OWN_ETA else -1
-            row, at = past(s, c.row), past(s, EPS)
-            call_evaluate(n.evaluate, row, s, at, change, own, DIRECTION, out)
+            direct(c, i, change, own, out)
         part[j] = out[0]
-    last[DERIVED] = 1.0
+    last.derived = 1.0
 
 
 @inner
-def _flow(c, i, f, quicker):  # type: ignore[no-untyped-def]
+def _flow(c, i, f, quicker):
     """Fill the rates of the derivatives of the internal variables."""
     s, n, p = spring(c, i), numbers(c, i), c.p
-    x, values, strain = n.internals, values_of(c, i), past(c.strain, i * p)
+    x, values, strain = n.internals, spring(c, i).by, past(c.strain, i * p)
     size, rate, pace, fixed = 2 + 2 * x, s.rate, c.drive.pace, n.fixed
     by, by_a, by_b = past(values, size), past(values, ALONG_A * size), past(values, ALONG_B * size)
     for k in range(x):
@@ -132,9 +99,9 @@ def _flow(c, i, f, quicker):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _friction(c, i, quicker, out):  # type: ignore[no-untyped-def]
+def _friction(c, i, quicker, out):
     """Add the derivatives of the stress V."""
-    values, size, p = values_of(c, i), 2 + 2 * numbers(c, i).internals, c.p
+    values, size, p = spring(c, i).by, 2 + 2 * numbers(c, i).internals, c.p
     strain, by_strain, by_rate = past(c.strain, i * p), values[size + 1], values[BY_RATE * size]
     for j in range(p):
         by_x = toward(c, i, j)[1]
@@ -142,19 +109,19 @@ def _friction(c, i, quicker, out):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _jump(c, i, up, y):  # type: ignore[no-untyped-def]
+def _jump(c, i, up, y):
     """Change the branch; the internal variables may jump, and their derivatives with them.
 
     Their rates may jump too, so that the delay of the instant of the change counts.
     """
     s, n, p = spring(c, i), numbers(c, i), c.p
     x, pace = n.internals, c.drive.pace
-    changes, first = changes_of(values_of(c, i), x), past(values_of(c, i), 2)  # A, then B
+    changes, first = contract.changes_of(spring(c, i).by, x), past(spring(c, i).by, 2)  # A, then B
     for k in range(x):
-        s[X + k] = y[n.x_at + k]
-    call_switch(n.switch, past(s, c.row), s, up, changes)
+        s.xs[k] = y[n.x_at + k]
+    contract.call_switch(n.switch, past(s, c.row), s, up, changes)
     for k in range(x):
-        y[n.x_at + k] = s[X + k]
+        y[n.x_at + k] = s.xs[k]
     if p == 0:
         return
     wide = 1 + x + n.parameters
@@ -195,7 +162,7 @@ def _jump(c, i, up, y):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _lose(c, i, common):  # type: ignore[no-untyped-def]
+def _lose(c, i, common):
     """Fill the strain rate of a damped spring under the stress of its group.
 
     Newton's method in logarithms inside a bracket: it takes one step for a power of the rate.
@@ -206,7 +173,7 @@ def _lose(c, i, common):  # type: ignore[no-untyped-def]
         s.rate = force / s.eta
         return
     sign, rate, low, high = 1.0 if force > 0.0 else -1.0, abs(s.rate), 0.0, math.inf
-    values = values_of(c, i)
+    values = spring(c, i).by
     rate = rate if rate > 0.0 else 1.0
     for _ in range(200):
         s.rate = sign * rate if force != 0.0 else 0.0
@@ -237,13 +204,13 @@ def _lose(c, i, common):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _share(c, g):  # type: ignore[no-untyped-def]
+def _share(c, g):
     """Fill the stress and the rates of damped springs that reach the rate of their group together.
 
     Of a viscous top the velocity is the unknown, as the stresses on both sides of its damper may
     hardly differ.
     """
-    i0, i1 = (c.ends[g - 1] if g > 0 else 0), c.ends[g]
+    i0, i1 = c.first[g], c.first[g + 1]
     push, rate, low, high = c.drive.push, c.drive.spread, -math.inf, math.inf
     drag = c.drive.dragged if g == c.groups - 1 and c.top == VISCOUS else 0.0
     now = c.carried[g] if drag == 0.0 else -c.drive.top_speed
@@ -276,7 +243,7 @@ def _share(c, g):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _losses(c, i, y, out):  # type: ignore[no-untyped-def]
+def _losses(c, i, y, out):
     """Add the derivatives of V of a spring in a group, at the strain rate that it has found."""
     p, at = c.p, numbers(c, i).eps_at
     for j in range(p):
@@ -288,7 +255,7 @@ def _losses(c, i, y, out):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _begin_ramp(c, want):  # type: ignore[no-untyped-def]
+def _begin_ramp(c, want):
     """Begin a ramp to the first sample of a drive. Under a prescribed stress dashpots are rigid."""
     r, drive, t, terms = c.now, c.drive, c.time, c.terms
     brief = RAMP * (t[c.samples - 1] - t[0]) if c.samples > 1 else RAMP
@@ -299,7 +266,7 @@ def _begin_ramp(c, want):  # type: ignore[no-untyped-def]
     masses[c.groups] = drive.pace
     drive.value, drive.value_rate, drive.pace = 0.0, c.values[0] / brief, 0.0
     drive.shift, drive.shift_rate = 0.0, in_contact(c, c.none) / brief
-    for i in range(c.ends[c.groups - 2] if c.groups > 1 else c.none, c.count):
+    for i in range(c.first[c.groups - 1], c.count):
         s, n = spring(c, i), numbers(c, i)
         kept = past(aside, i * (1 + terms))
         kept[0], s.gain = s.eta, 1.0
@@ -307,12 +274,12 @@ def _begin_ramp(c, want):  # type: ignore[no-untyped-def]
             s.eta = s.loss = 0.0 if c.top == MOTION else math.inf
             n.fixed = int(c.top == MOTION and n.eps_at >= 0)
         for k in range(terms):
-            kept[1 + k], s[RELAX + 2 * k] = s[RELAX + 2 * k], 0.0
+            kept[1 + k], s.g[k] = s.g[k], 0.0
     rates(c, c.y, c.stage, want, 0.0)
 
 
 @inner
-def _end_ramp(c, want):  # type: ignore[no-untyped-def]
+def _end_ramp(c, want):
     """Let time pass again: relaxation terms begin at zero, and dashpots at the present strain."""
     y, p, terms = c.y, c.p, c.terms
     aside, masses = c.aside, past(c.aside, c.count * (1 + terms))
@@ -320,12 +287,12 @@ def _end_ramp(c, want):  # type: ignore[no-untyped-def]
     c.drive.pace, c.now.grow = masses[c.groups], 1.0
     for g in range(c.groups):
         c.per_mass[g] = masses[g]
-    for i in range(c.ends[c.groups - 2] if c.groups > 1 else c.none, c.count):
+    for i in range(c.first[c.groups - 1], c.count):
         s, n = spring(c, i), numbers(c, i)
         kept = past(aside, i * (1 + terms))
         strain, part = past(c.strain, i * p), past(c.part, i * p)
         for k in range(terms):
-            s[RELAX + 2 * k] = kept[1 + k]
+            s.g[k] = kept[1 + k]
             y[n.z_at + k] = -s.sigma
             for j in range(p):
                 y[c.base + (n.z_at + k) * p + j] = -(s.steep * strain[j] + part[j])
@@ -338,33 +305,32 @@ def _end_ramp(c, want):  # type: ignore[no-untyped-def]
             for j in range(p):
                 y[c.base + n.eps_at * p + j] = strain[j]
         if n.fixed:
-            first, n.fixed = past(values_of(c, i), 2), 0
-            for k in range(n.internals if n.kind == INTERNAL else c.none):
+            first, n.fixed = past(spring(c, i).by, 2), 0
+            for k in range(n.internals if n.internal else c.none):
                 for j in range(p):
                     y[c.base + (n.x_at + k) * p + j] += first[k] * strain[j]
 
 
-@pointed(INSIDE)
-def inside_task(words, task, i, up, y, f, quicker, out):  # type: ignore[no-untyped-def]
+@working
+def inside_task(c, task, i, up, y, f, quicker, out):
     """Do one task, for a spring or a group."""
-    c = unpack(words)
-    if task == PART:
+    if task == motion.PART:
         _part(c, i, y, out)
-    elif task == FLOW:
+    elif task == motion.FLOW:
         _flow(c, i, f, quicker)
-    elif task == FRICTION:
+    elif task == motion.FRICTION:
         _friction(c, i, quicker, out)
-    elif task == PATH:
+    elif task == motion.PATH:
         _path(c, i)
-    elif task == LOSE:
+    elif task == motion.LOSE:
         _lose(c, i, c.carried[up])
-    elif task == SHARE:
+    elif task == motion.SHARE:
         _share(c, i)
-    elif task == LOSSES:
+    elif task == motion.LOSSES:
         _losses(c, i, y, out)
-    elif task == BEGIN_RAMP:
+    elif task == motion.BEGIN_RAMP:
         _begin_ramp(c, up)
-    elif task == END_RAMP:
+    elif task == motion.END_RAMP:
         _end_ramp(c, up)
     else:
         _jump(c, i, up, y)

@@ -5,57 +5,12 @@ from __future__ import annotations
 import math
 
 from foamfit.arrays import Array
-from foamfit.solve.compiled.events import (
-    DOUBTFUL,
-    FAILED,
-    PLAIN,
-    RELEASE,
-    RISEN,
-    ROUNDED,
-    TOP_END,
-    TURN,
-    call_step,
-    change_branch,
-    first_event,
-    keep_values,
-)
+from foamfit.solve import scene
+from foamfit.solve.compiled import events, run
 from foamfit.solve.compiled.motion import dense, look, rates
-from foamfit.solve.compiled.run import (
-    OF_EPS,
-    OF_V,
-    OF_W,
-    RECORD,
-    SCALES,
-    STEPPED,
-    begin_run,
-    numbers,
-    spring,
-    unpack,
-)
-from foamfit.solve.compiled.samples import APPROACH, FLIGHT, INSIDE, is_finite, write
-from foamfit.solve.scene import (
-    DONE,
-    FLAT_UNDER_STRESS,
-    NOT_FINITE,
-    STEP_UNDERFLOW,
-    STRESS,
-    TOO_MANY_STEPS,
-)
-from foamfit.springs.compiled.contract import (
-    BY,
-    BY_STRESS,
-    INTERNAL,
-    RELAX,
-    RESULTS,
-    WHOLE,
-    WHOLES_AT,
-    calling,
-    inner,
-    outer,
-    past,
-    pointed,
-    start,
-)
+from foamfit.solve.compiled.run import change_branch, numbers, spring, write
+from foamfit.solve.compiled.samples import APPROACH, FLIGHT, INSIDE, is_finite
+from foamfit.springs.compiled.contract import inner, outer, past, start
 from foamfit.springs.laws.record import BEGUN, STRUCK
 
 # Numbers that a run is given, after onsite damping and pace: velocity of a striker, tolerance,
@@ -76,16 +31,14 @@ ENDINGS = 10
 LEAST_SHARE = 1e-6  # of the largest scale of nodes, see `_fresh_scales`
 SWITCHED, RELEASED, STALLED = 1, 2, 3  # what happened in a step
 
-_call_drive = calling(WHOLE, RECORD, WHOLE, WHOLE)  #: `drive.next_piece`
-
 
 @inner
-def _first_step(c, tol):  # type: ignore[no-untyped-def]
+def _first_step(c, tol):
     """Return a first step of an impact, from the fastest vibration of a node at rest."""
     fastest, before = 0.0, 0.0
     for g in range(c.nodes - 1, -1, -1):
         soft = 0.0
-        for i in range(c.ends[g - 1] if g > 0 else 0, c.ends[g]):
+        for i in range(c.first[g], c.first[g + 1]):
             s = spring(c, i)
             stiff = s.gain * s.slope
             soft += s.height / stiff if stiff > 0.0 else 0.0
@@ -96,17 +49,17 @@ def _first_step(c, tol):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _mend(c, y):  # type: ignore[no-untyped-def]
+def _mend(c, y):
     """Bring what is integrated besides the state back to it: one step of Newton's method.
 
     So the stress of a BY_STRESS law stays that of its strain, and springs without a dashpot in one
     group keep one stress.
     """
     for g in range(c.none if not c.solved else c.groups, c.groups):
-        i0, soft, mean, count = c.ends[g - 1] if g > 0 else c.none, 0.0, 0.0, 0
-        for i in range(i0, c.ends[g]):
+        i0, soft, mean, count = c.first[g], 0.0, 0.0, 0
+        for i in range(i0, c.first[g + 1]):
             s, n = spring(c, i), numbers(c, i)
-            if n.kind == BY_STRESS:
+            if n.by_stress:
                 change = s.miss * s.slope
                 y[n.x_at] -= change
                 s.total -= s.gain * change
@@ -117,20 +70,20 @@ def _mend(c, y):  # type: ignore[no-untyped-def]
                 count -= c.count  # a flat branch takes the rest
         if count < 2:
             continue
-        for i in range(i0, c.ends[g]):
+        for i in range(i0, c.first[g + 1]):
             s, n = spring(c, i), numbers(c, i)
             if s.eta == 0.0:
                 longer = (mean / soft - s.total) / (s.gain * s.tangent)
                 y[n.eps_at] += longer
-                if n.kind == BY_STRESS:
+                if n.by_stress:
                     y[n.x_at] += longer * s.tangent
-                elif n.kind == INTERNAL:
+                elif n.internal:
                     for k in range(n.internals):
-                        y[n.x_at + k] += longer * s[RESULTS + BY + 2 + k]
+                        y[n.x_at + k] += longer * s.by[2 + k]
 
 
 @inner
-def _log(c, i, left):  # type: ignore[no-untyped-def]
+def _log(c, i, left):
     """Log a change of branch, if there is room."""
     s, r, at = spring(c, i), c.now, int(c.now.logged)
     if at < c.room:
@@ -140,7 +93,7 @@ def _log(c, i, left):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _switch(c, i, up, want):  # type: ignore[no-untyped-def]
+def _switch(c, i, up, want):
     """Change the branch of a spring now."""
     s, r = spring(c, i), c.now
     left, steep = s.branch, s.tangent
@@ -152,17 +105,17 @@ def _switch(c, i, up, want):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _leaves(c, i):  # type: ignore[no-untyped-def]
+def _leaves(c, i):
     """Whether a spring at an end of a flat branch leaves it, as a prescribed stress changes."""
     s, way = spring(c, i), c.drive.value_rate
-    if c.top != STRESS or s.eta > 0.0 or s.sigma_low < s.sigma_high:
+    if c.top != scene.STRESS or s.eta > 0.0 or s.sigma_low < s.sigma_high:
         return False
-    first, end = c.ends[c.groups - 2] if c.groups > 1 else c.none, s.high if way > 0.0 else s.low
-    return i >= first and way != 0.0 and abs(s.eps - end) < ROUNDED
+    first, end = c.first[c.groups - 1], s.high if way > 0.0 else s.low
+    return i >= first and way != 0.0 and abs(s.eps - end) < events.ROUNDED
 
 
 @inner
-def _turn(c, want, changed):  # type: ignore[no-untyped-def]
+def _turn(c, want, changed):
     """Let springs turn whose rate has changed its sign by a jump.
 
     The prescribed rate jumps, or the branch of a spring, `changed` (else -1), which makes it softer
@@ -184,10 +137,10 @@ def _turn(c, want, changed):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _pass_event(c, want, share, who, kind):  # type: ignore[no-untyped-def]
+def _pass_event(c, want, share, who, kind):
     """Move to an event in the step; return dS/dt at the end of contact, or change the branch."""
     r, y, n, slope = c.now, c.y, c.base + c.carries * c.p, 0.0
-    if kind == RELEASE:
+    if kind == events.RELEASE:
         look(c, share - 1e-3)
         before = c.carried[0]
         look(c, share + 1e-3)
@@ -200,29 +153,29 @@ def _pass_event(c, want, share, who, kind):  # type: ignore[no-untyped-def]
     rates(c, y, c.stage, want, r.now)
     _mend(c, y)
     rates(c, y, c.stage, want, r.now)
-    if kind == RELEASE:
+    if kind == events.RELEASE:
         return slope
     turns = spring(c, who).turns
-    _switch(c, who, int(turns < 0.0) if kind == TURN else int(kind == TOP_END), want)
+    _switch(c, who, int(turns < 0.0) if kind == events.TURN else int(kind == events.TOP_END), want)
     _turn(c, want, who)
     return slope
 
 
 @inner
-def _finish_step(c, struck):  # type: ignore[no-untyped-def]
+def _finish_step(c, struck):
     """Advance to the end of a step."""
     r, y, stage, new, wide = c.now, c.y, c.stage, c.new, c.wide
-    keep_values(c)
-    if struck and c.carried[0] > RISEN * r.largest:
+    events.keep_values(c)
+    if struck and c.carried[0] > events.RISEN * r.largest:
         r.pressed = 1.0
     for k in range(wide):
-        y[k], stage[k] = new[k], stage[STEPPED * wide + k]
+        y[k], stage[k] = new[k], stage[run.STEPPED * wide + k]
     _mend(c, y)
     r.now = r.horizon if r.now + r.step >= r.horizon else r.now + r.step
 
 
 @inner
-def _fresh_scales(c):  # type: ignore[no-untyped-def]
+def _fresh_scales(c):
     """Let the scales of the error cover what the next step may reach.
 
     A dashpot under a mass that hardly moves makes the base stress of its velocity, so each node has
@@ -233,15 +186,15 @@ def _fresh_scales(c):  # type: ignore[no-untyped-def]
         kind = kinds[k]
         scales[kind] = max(scales[kind], max(abs(y[k]), part * abs(rate[k])))
     for k in range(2 * c.nodes):
-        shared = OF_V if k % 2 else OF_W
+        shared = run.OF_V if k % 2 else run.OF_W
         scales[shared] = max(scales[shared], scales[kinds[k]])
     for k in range(2 * c.nodes):
-        shared = OF_V if k % 2 else OF_W
+        shared = run.OF_V if k % 2 else run.OF_W
         scales[kinds[k]] = max(scales[kinds[k]], LEAST_SHARE * scales[shared])
 
 
 @inner
-def _longest(c, want):  # type: ignore[no-untyped-def]
+def _longest(c, want):
     """Return the longest step.
 
     The error of a step keeps relaxation terms stable, but not their derivatives: near the limit of
@@ -252,19 +205,19 @@ def _longest(c, want):  # type: ignore[no-untyped-def]
         for i in range(c.count):
             s = spring(c, i)
             for k in range(c.terms):
-                if s[RELAX + 2 * k] > 0.0:
-                    longest = min(longest, FADES * s[RELAX + 2 * k + 1])
+                if s.g[k] > 0.0:
+                    longest = min(longest, FADES * s.tau[k])
     return longest
 
 
 @inner
-def _begin(c, reals):  # type: ignore[no-untyped-def]
+def _begin(c, reals):
     """Set scales and, for an impact, the striker."""
     r, top = c.now, c.groups - 1
-    for k in range(SCALES):
+    for k in range(run.SCALES):
         c.scales[k] = reals[LEAST + k]
     for i in range(c.count):  # of the strain of each spring
-        c.scales[SCALES + i] = reals[LEAST + OF_EPS]
+        c.scales[run.SCALES + i] = reals[LEAST + run.OF_EPS]
     r.brief, r.last, r.grow, c.drive.overdamped = reals[BRIEFLY], 1e-4, 1.0, reals[OVER]
     if reals[SPEED] > 0.0:
         c.y[2 * top + 1] = reals[SPEED]
@@ -274,7 +227,7 @@ def _begin(c, reals):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _strike(c, want):  # type: ignore[no-untyped-def]
+def _strike(c, want):
     """Fill the rates at contact; derivatives by its time and by the velocity of the striker."""
     y, p, top = c.y, c.p, c.groups - 1
     rates(c, y, c.stage, c.none, 0.0)
@@ -288,37 +241,33 @@ def _strike(c, want):  # type: ignore[no-untyped-def]
         rates(c, y, c.stage, want, 0.0)
 
 
-@pointed(WHOLE(WHOLES_AT, WHOLE, WHOLE, WHOLE))
-def advance(words, how, struck, want):  # type: ignore[no-untyped-def]
+@run.advancing
+def advance(c, how, struck, want):
     """Go to the first event in the step or to its end, and write its samples.
 
     Return what happened: nothing, an event, the end of contact, or an event without any progress.
     """
-    c = unpack(words)
     r, share, who, kind = c.now, 1.0, -1, -1
-    if how == DOUBTFUL:
-        share, who, kind = first_event(c)
-    if struck and how != PLAIN:
+    if how == events.DOUBTFUL:
+        share, who, kind = events.first_event(c)
+    if struck and how != events.PLAIN:
         whole = who < 0 and r.now + r.step >= r.horizon
         write(c, c.y, r.horizon if whole else r.now + share * r.step, INSIDE, want)
     if who < 0:
-        if how != PLAIN:
+        if how != events.PLAIN:
             rates(c, c.new, c.f, c.none, r.now + r.step)
         _finish_step(c, struck)
         return c.none
     moved = share * r.step > 1e-15 * abs(r.now)
     slope = _pass_event(c, want, share, who, kind)
-    if kind == RELEASE:
+    if kind == events.RELEASE:
         write(c, c.y, slope, FLIGHT, c.none)
         return RELEASED + c.none
     return (SWITCHED if moved else STALLED) + c.none
 
 
-_call_advance = calling(WHOLE, RECORD, WHOLE, WHOLE, WHOLE)
-
-
 @inner
-def _is_hopeless(c, most):  # type: ignore[no-untyped-def]
+def _is_hopeless(c, most):
     """Whether a run along a drive would take far too many steps, by those so far."""
     r, t, last = c.now, c.time, c.samples - 1
     share = (r.begun + r.now - t[0]) / (t[last] - t[0])
@@ -326,27 +275,25 @@ def _is_hopeless(c, most):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _failure(c, how, most, gives_up):  # type: ignore[no-untyped-def]
+def _failure(c, how, most, gives_up):
     """Return how a run ends after a step: DONE if it goes on."""
     if c.drive.flat > 0.0:
-        return c.none + FLAT_UNDER_STRESS
-    if how == FAILED and not abs(c.new[0]) < math.inf:
-        return c.none + NOT_FINITE
+        return c.none + scene.FLAT_UNDER_STRESS
+    if how == events.FAILED and not abs(c.new[0]) < math.inf:
+        return c.none + scene.NOT_FINITE
     if c.now.taken >= most or (gives_up and _is_hopeless(c, most)):
-        return c.none + TOO_MANY_STEPS
-    return c.none + (STEP_UNDERFLOW if how == FAILED else DONE)
+        return c.none + scene.TOO_MANY_STEPS
+    return c.none + (scene.STEP_UNDERFLOW if how == events.FAILED else scene.DONE)
 
 
 @outer
-def integrate(  # type: ignore[no-untyped-def]
-    ints, floats, rows, heights, mass, reals, values, time, out, log, endings
-):  # fmt: skip
+def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log, endings):
     """Integrate a chain over sample times; fill `endings`.
 
     `out` (1 + p, 1 + nodes, n) becomes base stress and displacements, and their derivatives, `log`
     the switches; `ints` and `floats`, zeros, are the memory of the run.
     """
-    c = begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals)
+    c = run.begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals)
     given, told = start(reals), start(endings)
     r, want, struck = c.now, int(c.p > 0), int(given[SPEED] > 0.0)
     tol, most, stalled, done = given[TOL], given[MOST], 0, 0
@@ -359,34 +306,34 @@ def integrate(  # type: ignore[no-untyped-def]
             top = 2 * c.groups - 1
             r.step = min(r.step, STOPPED * abs(c.y[top] / c.stage[top]))
     else:
-        done = _call_drive(c.drive_at, c, 1, want)
+        done = run.call_drive(c, 1, want)
         r.step = r.horizon
-    outcome, ended, longest = DONE, math.nan, _longest(c, want)
+    outcome, ended, longest = scene.DONE, math.nan, _longest(c, want)
     gives_up = given[FOLLOWED] > 0.0 and not struck
     while not (done or (struck and int(r.sample) == c.samples)):
         _fresh_scales(c)
-        keep_values(c)
+        events.keep_values(c)
         r.step = min(r.step, r.horizon - r.now, longest)
         upto = c.time[int(r.sample)] if struck else math.inf
-        how = call_step(c.step_at, c, want, tol, upto, most)
+        how = run.call_step(c, want, tol, upto, most)
         outcome = _failure(c, how, most, gives_up)
-        event = _call_advance(c.advance_at, c, how, struck, want) if outcome == DONE else c.none
+        event = run.call_advance(c, how, struck, want) if outcome == scene.DONE else c.none
         stalled = stalled + 1 if event == STALLED else 0
         if stalled > 4 * c.count + 8:
-            outcome = STEP_UNDERFLOW
-        if outcome != DONE or event == RELEASED:
+            outcome = scene.STEP_UNDERFLOW
+        if outcome != scene.DONE or event == RELEASED:
             ended = r.begun + r.now
             break
         dt = r.step * r.grow
         if r.now >= r.horizon and struck:
             r.horizon = math.nextafter(r.now, math.inf)
         elif r.now >= r.horizon:
-            done = _call_drive(c.drive_at, c, 0, want)
+            done = run.call_drive(c, 0, want)
             _turn(c, want, -1 + c.none)
         r.step = dt
     told[OUTCOME], told[ENDED] = outcome, ended
     told[STEPS], told[SWITCHES], told[FINITE] = r.taken, r.logged, is_finite(c, c.shown)
-    told[STRONGEST], told[FARTHEST] = r.largest, c.scales[OF_W]
+    told[STRONGEST], told[FARTHEST] = r.largest, c.scales[run.OF_W]
     told[DAMPED_OUT] = r.damped
     told[MOTION_LOST], told[STRESS_LOST] = c.worst[0], c.worst[1]
 

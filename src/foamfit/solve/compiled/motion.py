@@ -10,131 +10,90 @@ from __future__ import annotations
 
 import math
 
-from numba import types
-
-from foamfit.solve.compiled.run import RECORD, numbers, spring, unpack
+from foamfit.solve.compiled import run
+from foamfit.solve.compiled.run import call_inside, numbers, spring
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
-from foamfit.springs.compiled.contract import (
-    BY,
-    BY_HELD,
-    BY_STRESS,
-    EPS,
-    EXPLICIT,
-    INTERNAL,
-    PATHS,
-    REAL,
-    REALS_AT,
-    RELAX,
-    RESULTS,
-    WHOLE,
-    WHOLES_AT,
-    X,
-    call_evaluate,
-    call_number,
-    calling,
-    inlined,
-    inner,
-    past,
-    pointed,
-)
+from foamfit.springs.compiled import contract
+from foamfit.springs.compiled.contract import inlined, inner, past
 from foamfit.springs.laws.record import HEAVIER, MOVED, OWN_RELAXATION
 
-#: record, group, state, rates, whether with derivatives, time since the piece began; returns S
-GROUP = REAL(WHOLES_AT, WHOLE, REALS_AT, REALS_AT, WHOLE, REAL)
-#: record, task (below), spring or group, up or whether with derivatives, state, rates, derivatives
-#: of the strain rate, results
-INSIDE = types.void(WHOLES_AT, WHOLE, WHOLE, WHOLE, REALS_AT, REALS_AT, REALS_AT, REALS_AT)
+# Tasks of `internal`.
 PART, FLOW, FRICTION, JUMP, PATH, LOSE, SHARE, LOSSES, BEGIN_RAMP, END_RAMP = range(10)
 ALL, IN_STEP = -1, -2  # instead of a group
 ONLY_DERIVATIVES = 2  # instead of 0 or 1 for `want`, where the values are known
-
-
-_call_group = calling(REAL, RECORD, WHOLE, REALS_AT, REALS_AT, WHOLE, REAL)
-_call_inside = calling(
-    types.void, RECORD, WHOLE, WHOLE, WHOLE, REALS_AT, REALS_AT, REALS_AT, REALS_AT
-)
-_call_rates = calling(types.void, RECORD, REALS_AT, REALS_AT, WHOLE, REAL, WHOLE)
-
-
-@inlined
-def call_inside(c, task, i, up, y, f, quicker, out):  # type: ignore[no-untyped-def]
-    """Do a task of `internal` for a spring of an INTERNAL law."""
-    _call_inside(c.inside_at, c, task, i, up, y, f, quicker, out)
 
 
 # ---------------------------------------------------------------- springs
 
 
 @inner
-def evaluate(c, i, want):  # type: ignore[no-untyped-def]
+def evaluate(c, i, want):
     """Fill the results of the law of a spring at its strain and internal variables."""
     s, n = spring(c, i), numbers(c, i)
-    row, out = past(s, c.row), past(s, RESULTS)
-    call_evaluate(n.evaluate, row, s, past(s, EPS), past(s, X), 1, want, out)
+    contract.call_evaluate(n.evaluate, past(s, c.row), s, s.point, s.xs, 1, want, s.results)
 
 
 @inner
-def follow_spring(c, i, eps, y, f, want):  # type: ignore[no-untyped-def]
+def follow_spring(c, i, eps, y, f, want):
     """Fill the values of a spring at a strain, and the rates of its relaxation terms; return T."""
     s, n = spring(c, i), numbers(c, i)
-    kind = n.kind
-    if kind == BY_STRESS and c.solved:
-        call_number(n.settle, past(s, c.row), s, eps)
-    elif kind != EXPLICIT:
+    if n.by_stress and c.solved:
+        contract.call_number(n.settle, past(s, c.row), s, eps)
+    else:
         for k in range(n.internals):
-            s[X + k] = y[n.x_at + k]
+            s.xs[k] = y[n.x_at + k]
     s.eps = eps
-    evaluate(c, i, PATHS if n.fixed and kind == INTERNAL else want)
+    evaluate(c, i, contract.PATHS if n.fixed and n.internal else want)
     sigma, tangent, drift = s.sigma, s.slope, 0.0
-    if kind == INTERNAL and n.fixed:
+    if n.internal and n.fixed:
         call_inside(c, PATH, i, c.none, y, f, y, y)
         tangent, drift = s.tangent, s.drift
     stress = s.gain * sigma
     for k in range(c.terms):
-        z, at = y[n.z_at + k], RELAX + 2 * k
-        dz = -(z + sigma) / s[at + 1]
+        z = y[n.z_at + k]
+        dz = -(z + sigma) / s.tau[k]
         f[n.z_at + k] = dz
-        stress += s[at] * z
-        drift += s[at] * dz
+        stress += s.g[k] * z
+        drift += s.g[k] * dz
     s.total, s.drift, s.tangent = stress, drift, tangent
     return stress
 
 
 @inner
-def move_inside(c, i, f):  # type: ignore[no-untyped-def]
+def move_inside(c, i, f):
     """Fill the rates of the internal variables of a spring."""
     s, n = spring(c, i), numbers(c, i)
-    if n.kind == BY_STRESS and not c.solved:
+    if n.by_stress and not c.solved:
         f[n.x_at] = s.slope * s.rate
-    elif n.kind == INTERNAL:
-        x, values = n.internals, past(s, RESULTS + BY)
+    elif n.internal:
+        x, values = n.internals, s.by
         for k in range(x):
             f[n.x_at + k] = values[2 + k] * s.rate + c.drive.pace * values[2 + x + k]
 
 
 @inner
-def derive_spring(c, i, y):  # type: ignore[no-untyped-def]
+def derive_spring(c, i, y):
     """Fill the derivatives of the stress of a spring at fixed strain, and of T at fixed strain."""
     s, n, p = spring(c, i), numbers(c, i), c.p
     part, total = past(c.part, i * p), past(c.part, (c.count + i) * p)
-    out, owned, directions = past(s, RESULTS), c.owned, c.directions
+    owned, directions = c.owned, c.directions
     s.steep = s.tangent if n.fixed else s.slope
     for j in range(p):
         part[j] = 0.0
-    if n.kind == BY_STRESS:
-        a, b, held = out[BY_HELD], out[BY_HELD + 1], past(c.held, 2 * i * p)
+    if n.by_stress:
+        a, b, held = s.by_held[0], s.by_held[1], past(c.held, 2 * i * p)
         for j in range(p):
             part[j] = a * held[j] + b * held[p + j]
-    if n.kind == INTERNAL:
+    if n.internal:
         call_inside(c, PART, i, c.none, y, y, y, part)
     else:
         for k in range(owned[i], owned[i + 1]):
-            part[owned[k]] += out[BY + directions[2 * owned[k] + 1]]
+            part[owned[k]] += s.by[directions[2 * owned[k] + 1]]
     gain = s.gain
     for j in range(p):
         total[j] = gain * part[j]
     for k in range(c.terms):
-        g, dz, of_g = s[RELAX + 2 * k], past(y, c.base + (n.z_at + k) * p), OWN_RELAXATION + 2 * k
+        g, dz, of_g = s.g[k], past(y, c.base + (n.z_at + k) * p), OWN_RELAXATION + 2 * k
         for j in range(p):
             total[j] += g * dz[j]
             if directions[2 * j] == i and directions[2 * j + 1] == of_g:
@@ -142,7 +101,7 @@ def derive_spring(c, i, y):  # type: ignore[no-untyped-def]
 
 
 @inner
-def derive_inside(c, i, y, f, quicker):  # type: ignore[no-untyped-def]
+def derive_inside(c, i, y, f, quicker):
     """Fill the rates of the derivatives of relaxation terms and of internal variables.
 
     `quicker` are the derivatives of the strain rate, for INTERNAL laws; not read if unknown.
@@ -151,13 +110,13 @@ def derive_inside(c, i, y, f, quicker):  # type: ignore[no-untyped-def]
     part, strain = past(c.part, i * p), past(c.strain, i * p)
     directions, slope = c.directions, s.steep
     for k in range(c.terms):
-        at, per = c.base + (n.z_at + k) * p, 1.0 / s[RELAX + 2 * k + 1]
+        at, per = c.base + (n.z_at + k) * p, 1.0 / s.tau[k]
         more, of_tau = (y[n.z_at + k] + s.sigma) * per * per, OWN_RELAXATION + 2 * k + 1
         for j in range(p):
             f[at + j] = -per * (y[at + j] + slope * strain[j] + part[j])
             if directions[2 * j] == i and directions[2 * j + 1] == of_tau:
                 f[at + j] += more
-    if n.kind == INTERNAL:
+    if n.internal:
         call_inside(c, FLOW, i, c.none, y, f, quicker, f)
 
 
@@ -165,7 +124,7 @@ def derive_inside(c, i, y, f, quicker):  # type: ignore[no-untyped-def]
 
 
 @inner
-def span_of(c, g, y, at):  # type: ignore[no-untyped-def]
+def span_of(c, g, y, at):
     """Return elongation and its rate of a group, as far as its nodes tell."""
     last = g == c.groups - 1
     if last and c.top == MOTION:
@@ -182,20 +141,20 @@ def span_of(c, g, y, at):  # type: ignore[no-untyped-def]
 
 
 @inner
-def is_alone(c, g):  # type: ignore[no-untyped-def]
+def is_alone(c, g):
     """Whether the strain of a group follows from its nodes: one spring, and no massless top."""
-    first = c.ends[g - 1] if g > 0 else 0
-    return c.ends[g] - first == 1 and (g < c.groups - 1 or c.top == FREE or c.top == MOTION)
+    one = c.first[g + 1] - c.first[g] == 1
+    return one and (g < c.groups - 1 or c.top == FREE or c.top == MOTION)
 
 
 @inlined
-def in_contact(c, k):  # type: ignore[no-untyped-def]
+def in_contact(c, k):
     """Return the derivative of sample k of a prescribed motion by its shift: 1 in contact."""
     return 1.0 if c.values[k] > 0.0 else 0.0
 
 
 @inner
-def span_tangents(c, g, y, reach, rate):  # type: ignore[no-untyped-def]
+def span_tangents(c, g, y, reach, rate):
     """Fill the derivatives of elongation and rate of a group, as far as its nodes tell."""
     p, last = c.p, g == c.groups - 1
     for j in range(p):
@@ -217,21 +176,21 @@ def span_tangents(c, g, y, reach, rate):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _follow_one(c, g, i, y, f, want, at):  # type: ignore[no-untyped-def]
+def _follow_one(c, g, i, y, f, want, at):
     """Fill the values of a spring between two nodes, and their part of the rates; return S."""
     s, n = spring(c, i), numbers(c, i)
     reach, rate = span_of(c, g, y, at)
     s.rate = rate = rate * s.per_height
     common = follow_spring(c, i, reach * s.per_height, y, f, want) + s.eta * rate
     move_inside(c, i, f)
-    if n.kind == INTERNAL:
-        common += c.drive.pace * s[RESULTS + BY + 1]
+    if n.internal:
+        common += c.drive.pace * s.by[1]
     c.carried[g] = common
     return common
 
 
 @inner
-def _derive_one(c, g, i, y, f):  # type: ignore[no-untyped-def]
+def _derive_one(c, g, i, y, f):
     """Fill the derivatives of the stress of a spring between two nodes, and of its rates."""
     p = c.p
     out = past(c.common, g * p)
@@ -246,7 +205,7 @@ def _derive_one(c, g, i, y, f):  # type: ignore[no-untyped-def]
         rate[j] = (rate[j] - faster * own[j]) * per
         out[j] = slope * strain[j] + total[j] + own[p + j] * faster + eta * rate[j]
     derive_inside(c, i, y, f, rate)
-    if numbers(c, i).kind == INTERNAL:
+    if numbers(c, i).internal:
         call_inside(c, FRICTION, i, c.none, y, f, rate, out)
 
 
@@ -254,7 +213,7 @@ def _derive_one(c, g, i, y, f):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _accelerate(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
+def _accelerate(c, g, y, f, want, at):
     """Fill the rates of a node, and of their derivatives."""
     p, last = c.p, g == c.groups - 1
     v, per, drag = y[2 * g + 1], c.per_mass[g], 0.0
@@ -280,7 +239,7 @@ def _accelerate(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
 
 
 @inner
-def dense(c, n, x, out):  # type: ignore[no-untyped-def]
+def dense(c, n, x, out):
     """Fill the state at the share x of the step."""
     z, line, wide, y = 1.0 - x, c.line, c.wide, c.y
     if c.degree:
@@ -297,7 +256,7 @@ def dense(c, n, x, out):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _stress_of_momentum(c, x):  # type: ignore[no-untyped-def]
+def _stress_of_momentum(c, x):
     """Return the stress from the acceleration of the striker by an implicit step.
 
     Where an overdamped contact ends, spring and dashpot carry opposite stresses whose sum has lost
@@ -309,10 +268,9 @@ def _stress_of_momentum(c, x):  # type: ignore[no-untyped-def]
     return c.drive.value - c.drive.dragged * c.state[1] - rate / c.now.step / c.per_mass[0]
 
 
-@pointed(types.void(WHOLES_AT, REALS_AT, REALS_AT, WHOLE, REAL, WHOLE))
-def compute_rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
+@run.computing
+def compute_rates(c, y, f, want, at, only):
     """Fill the rates f of a state y, or only the values of one group, or those in a step."""
-    c = unpack(words)
     share = at
     if only == IN_STEP and share == c.now.seen:
         return
@@ -325,13 +283,13 @@ def compute_rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
         if only >= 0 and g != only:
             continue
         if is_alone(c, g):
-            i = c.ends[g] - 1
+            i = c.first[g]
             if want != ONLY_DERIVATIVES:
                 _follow_one(c, g, i, y, f, want, at)
             if want:
                 _derive_one(c, g, i, y, f)
         else:
-            _call_group(c.group_at, c, g, y, f, want, at)
+            run.call_group(c, g, y, f, want, at)
     if only >= 0:
         return
     for g in range(c.nodes):
@@ -344,18 +302,18 @@ def compute_rates(words, y, f, want, at, only):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def rates(c, y, f, want, at):  # type: ignore[no-untyped-def]
+def rates(c, y, f, want, at):
     """Fill the rates f of a state y (with derivatives if `want`), `at` a time since the piece."""
-    _call_rates(c.rates_at, c, y, f, want, at, ALL)
+    run.call_rates(c, y, f, want, at, ALL)
 
 
 @inlined
-def rates_of(c, g, y, f, want, at):  # type: ignore[no-untyped-def]
+def rates_of(c, g, y, f, want, at):
     """Fill the values of one group, as `rates` does."""
-    _call_rates(c.rates_at, c, y, f, want, at, g)
+    run.call_rates(c, y, f, want, at, g)
 
 
 @inlined
-def look(c, x):  # type: ignore[no-untyped-def]
+def look(c, x):
     """Fill the values of all springs at the share x of the step."""
-    _call_rates(c.rates_at, c, c.state, c.f, 0, x, IN_STEP)
+    run.call_rates(c, c.state, c.f, 0, x, IN_STEP)

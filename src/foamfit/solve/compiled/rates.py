@@ -43,17 +43,10 @@ def is_overdamped(
 
 
 def fastest_rates(
-    first: Sequence[float],
-    steep: Sequence[float],
-    eta: Sequence[float],
-    heights: Sequence[float],
-    ends: Sequence[int],
-    mass: Sequence[float],
-    drag: float,
-    top: int,
-    struck: bool,
+    first: Sequence[float], steep: Sequence[float], eta: Sequence[float], heights: Sequence[float],
+    ends: Sequence[int], mass: Sequence[float], drag: float, top: int, struck: bool,
     duration: float,
-) -> tuple[float, float]:
+) -> tuple[float, float]:  # fmt: skip
     """Estimate the fastest vibration and relaxation of a scene, as rate times duration (radians).
 
     `first` and `steep` are the slopes of the springs at rest and at most, `mass` that of the nodes;
@@ -97,12 +90,12 @@ def fastest_rates(
 
 
 @inner
-def stiffness_of(c, g, damped):  # type: ignore[no-untyped-def]
+def stiffness_of(c, g, damped):
     """Return the stiffness of a group or, if `damped`, its damping; 0 beyond both ends."""
     if g >= c.groups or (g == c.groups - 1 and c.nodes < c.groups and c.top == STRESS):
         return 0.0
     soft = 0.0
-    for i in range(c.ends[g - 1] if g > 0 else 0, c.ends[g]):
+    for i in range(c.first[g], c.first[g + 1]):
         s = spring(c, i)
         part = s.eta if damped else s.gain * s.tangent
         soft += s.height / part if part > 0.0 else math.inf
@@ -110,7 +103,7 @@ def stiffness_of(c, g, damped):  # type: ignore[no-untyped-def]
 
 
 @inner
-def is_unresolved(c, span):  # type: ignore[no-untyped-def]
+def is_unresolved(c, span):
     """Whether a mass vibrates too fast for a step and keeps vibrating after it."""
     for g in range(c.nodes):
         own = math.sqrt((stiffness_of(c, g, False) + stiffness_of(c, g + 1, False)) * c.per_mass[g])
@@ -121,7 +114,7 @@ def is_unresolved(c, span):  # type: ignore[no-untyped-def]
 
 
 @inner
-def remember(c, span, wait):  # type: ignore[no-untyped-def]
+def remember(c, span, wait):
     """Add the vibrations that a step was too long to resolve to those the response lacks.
 
     A mass whose velocity differs by δv from the initial velocity of the step's polynomial then

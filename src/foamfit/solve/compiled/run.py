@@ -16,30 +16,17 @@ computed.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from llvmlite import ir
 from numba import types
 from numba.core.typing.templates import AttributeTemplate
-from numba.extending import infer_getattr, intrinsic, lower_getattr_generic, models, register_model
+from numba.extending import infer_getattr, lower_getattr_generic, models, register_model
 
-from foamfit.springs.compiled.contract import (
-    REAL,
-    REALS_AT,
-    RELAX,
-    SPRING,
-    WHOLE,
-    WHOLES_AT,
-    Named,
-    address,
-    as_spring,
-    call_begin,
-    inlined,
-    inner,
-    past,
-    pointing,
-    start,
-)
+from foamfit.springs.compiled import contract
+from foamfit.springs.compiled.contract import REAL, REALS_AT, WHOLE, address, inner, past, start
 from foamfit.springs.laws.record import DRAG, OWN_ETA, OWN_HEIGHT
 
 # Arrays of floats: blocks of `width` numbers of the springs (see `compiled.contract`); area over
@@ -58,11 +45,11 @@ FLOATS = (
     "now", "stage", "line", "y", "new", "state", "f", "nil", "errors", "batch", "aside",
     "jacobian", "alive", "worst", "largest", "kept", "systems", "right",
 )  # fmt: skip
-# Arrays of integers: rows of NUMBERS of the springs; one past the last spring of each group;
+# Arrays of integers: rows of NUMBERS of the springs; first spring of each group, and their number;
 # directions of the derivatives, (p, 2); where the directions of each spring begin and end, and
 # these directions; kinds of the components. Those of implicit steps: pivots, SYSTEMS of n; places
 # of the components in the systems, and their groups.
-INTEGERS = ("numbers", "ends", "directions", "owned", "kinds", "pivots", "places", "groups_of")
+INTEGERS = ("numbers", "first", "directions", "owned", "kinds", "pivots", "places", "groups_of")
 GIVEN = ("time", "values", "out", "log")  # arrays of the caller
 ADDRESSES = (
     "rates_at", "group_at", "inside_at", "change_at", "step_at", "advance_at", "drive_at",
@@ -85,12 +72,13 @@ TIME, VALUES, OUT, LOG = (AT[name] for name in GIVEN)
 SAMPLES, SHOWN, ROOM = AT["samples"], AT["shown"], AT["room"]
 _FLOATS_END, _INTEGERS_END = len(FLOATS), len(FLOATS) + len(INTEGERS)
 
-# Integers of a spring: the addresses of its law, kind, number of parameters and of internal
-# variables; the places of strain, internal variables and relaxation terms in the state (-1: none);
-# and whether the derivatives of its internal variables are those at a fixed strain, see `internal`.
+# Integers of a spring: the addresses of its law, whether it is a BY_STRESS or an INTERNAL one,
+# number of parameters and of internal variables; the places of strain, internal variables and
+# relaxation terms in the state (-1: none); and whether the derivatives of its internal variables
+# are those at a fixed strain, see `internal`.
 NUMBERS = (
-    "begin", "evaluate", "switch", "settle", "strain", "kind", "parameters", "internals", "eps_at",
-    "x_at", "z_at", "fixed",
+    "begin", "evaluate", "switch", "settle", "strain", "by_stress", "internal", "parameters",
+    "internals", "eps_at", "x_at", "z_at", "fixed",
 )  # fmt: skip
 OF_SPRING = len(NUMBERS)
 # Kinds of components of the state, which share a scale: displacement, velocity, strain, stress.
@@ -137,15 +125,15 @@ register_model(Run)(models.OpaqueModel)
 
 
 def _named(name: str, kind: Any, fields: tuple[str, ...]) -> Any:
-    return Named(name, kind, {field: k for k, field in enumerate(fields)})
+    return contract.Named(name, kind, {field: k for k, field in enumerate(fields)})
 
 
 _NUMBERS = _named("Numbers", WHOLE, NUMBERS)
 _TYPES = {
-    "springs": SPRING, "numbers": _NUMBERS, "drive": _named("Drive", REAL, DRIVE),
+    "springs": contract.SPRING, "numbers": _NUMBERS, "drive": _named("Drive", REAL, DRIVE),
     "now": _named("Now", REAL, NOW),
 }  # fmt: skip
-_as_numbers = pointing(_NUMBERS)
+_as_numbers, _as_record = contract.pointing(_NUMBERS), contract.pointing(RECORD)
 
 
 def _type_of(name: str) -> Any:
@@ -154,63 +142,91 @@ def _type_of(name: str) -> Any:
         return _TYPES[name]
     if name in FLOATS or name in GIVEN:
         return types.CPointer(types.complex128) if name in ("systems", "right") else REALS_AT
-    return WHOLES_AT if name in INTEGERS or name == "words" else WHOLE
+    return contract.WHOLES_AT if name in INTEGERS else WHOLE
 
 
 @infer_getattr
 class _Fields(AttributeTemplate):  # type: ignore[misc]
-    """Types of the fields of a record; `words` is the record itself."""
+    """Types of the fields of a record."""
 
     key = Run
 
     def generic_resolve(self, run: Any, name: str) -> Any:
         """Return the type of a field, or None if the record has no such field."""
-        return _type_of(name) if name in AT or name == "words" else None
+        return _type_of(name) if name in AT else None
 
 
 @lower_getattr_generic(Run)
-def _field(context, builder, typ, value, name):  # type: ignore[no-untyped-def]
+def _field(context, builder, typ, value, name):
     """Load a field."""
-    if name == "words":
-        return builder.bitcast(value, ir.IntType(64).as_pointer())
     kind = context.get_value_type(_type_of(name))
     first = builder.bitcast(value, kind.as_pointer())
     return builder.load(builder.gep(first, [ir.Constant(ir.IntType(64), AT[name])]))
 
 
-@intrinsic
-def unpack(typing, words):  # type: ignore[no-untyped-def]
-    """Return the record at an address."""
+def _pointed(field: str, returns: Any, *takes: Any) -> tuple[Callable[..., contract.Pointed], Any]:
+    """Return a decorator for functions whose address is in a field, and what calls them.
 
-    def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.bitcast(args[0], context.get_value_type(RECORD))
+    They take the record and numbers of these types.
+    """
+    signature = returns(RECORD, *takes)
 
-    return RECORD(WHOLES_AT), emit
+    def emit(context, builder, given, args):
+        where = _field(context, builder, RECORD, args[0], field)
+        return contract.by_address(context, builder, given, [where, *args])
+
+    return partial(contract.Pointed, signature), contract.emitted(signature, emit)
 
 
-@inlined
-def spring(c, i):  # type: ignore[no-untyped-def]
+# After the record they take:
+# state, rates, whether with derivatives, time since the piece began, group or ALL, see `motion`
+computing, call_rates = _pointed("rates_at", types.void, REALS_AT, REALS_AT, WHOLE, REAL, WHOLE)
+# group, state, rates, whether with derivatives, time since the piece began; returns S
+grouping, call_group = _pointed("group_at", REAL, WHOLE, REALS_AT, REALS_AT, WHOLE, REAL)
+# task (see `internal`), spring or group, up or whether with derivatives, state, rates, derivatives
+# of the strain rate, results
+working, call_inside = _pointed(
+    "inside_at", types.void, WHOLE, WHOLE, WHOLE, REALS_AT, REALS_AT, REALS_AT, REALS_AT
+)
+# spring, whether it leaves its branch at the upper end, state
+entering, change_branch = _pointed("change_at", types.void, WHOLE, WHOLE, REALS_AT)
+# whether with derivatives, tolerance, time of the next sample, bound on steps; returns how it ended
+stepping, call_step = _pointed("step_at", WHOLE, WHOLE, REAL, REAL, REAL)
+# how the step ended, whether a striker is in contact, whether with derivatives; returns the event
+advancing, call_advance = _pointed("advance_at", WHOLE, WHOLE, WHOLE, WHOLE)
+# whether a drive begins, whether with derivatives; returns whether all samples are written
+driving, call_drive = _pointed("drive_at", WHOLE, WHOLE, WHOLE)
+# state, time since the piece began, sample or task (see `samples`), whether with derivatives
+sampling, write = _pointed("write_at", types.void, REALS_AT, REAL, WHOLE, WHOLE)
+# strain, time until then, tolerance, derivatives by a shift of the motion, results
+fading, call_fade = _pointed("fade_at", WHOLE, REAL, REAL, REAL, REALS_AT, REALS_AT)
+# whether with derivatives, tolerance; returns 1 if the step was taken
+shortening, call_short = _pointed("short_at", WHOLE, WHOLE, REAL)
+
+
+@contract.inlined
+def spring(c, i):
     """Return the block of a spring."""
-    return as_spring(past(c.springs, i * c.width))
+    return contract.as_spring(past(c.springs, i * c.width))
 
 
-@inlined
-def numbers(c, i):  # type: ignore[no-untyped-def]
+@contract.inlined
+def numbers(c, i):
     """Return the integers of a spring."""
     return _as_numbers(past(c.numbers, i * OF_SPRING))
 
 
 @inner
-def sum_gain(c, i):  # type: ignore[no-untyped-def]
+def sum_gain(c, i):
     """Fill the gain 1 + Σ g of a spring."""
     s = spring(c, i)
     s.gain = 1.0
     for k in range(c.terms):
-        s.gain += s[RELAX + 2 * k]
+        s.gain += s.g[k]
 
 
 @inner
-def begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals):  # type: ignore[no-untyped-def]
+def begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals):
     """Fill the record of a run, set all springs at rest, and return the record.
 
     `ints` are places instead of addresses, `floats` zeros. reals[0] is the onsite damping, reals[1]
@@ -220,23 +236,23 @@ def begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals):
     for k in range(_INTEGERS_END):
         first = address(start(floats)) if k < _FLOATS_END else address(words)
         words[k] = first + 8 * words[k]
-    words[TIME], words[VALUES] = address(start(time)), address(start(values))
-    words[OUT], words[LOG] = address(start(out)), address(start(log))
+    words[TIME], words[VALUES] = (address(start(time)), address(start(values)))
+    words[OUT], words[LOG] = (address(start(out)), address(start(log)))
     words[SAMPLES], words[SHOWN], words[ROOM] = time.size, out.shape[1], log.shape[0]
-    c = unpack(words)
+    c = _as_record(words)
     width, own = rows.shape[1], rows.shape[1] - (c.width - c.row)  # first column of the laws
-    given, tall, heavy, settings = start(rows), start(heights), start(mass), start(reals)
+    given, tall, heavy, settings = (start(rows), start(heights), start(mass), start(reals))
     for i in range(c.count):
         s, n, height = spring(c, i), numbers(c, i), tall[i]
         s.height, s.per_height = height, 1.0 / height
         s.eta, s.loss = given[0], given[0]
         for k in range(c.terms):
-            s[RELAX + 2 * k], s[RELAX + 2 * k + 1] = given[1 + 2 * k], given[2 + 2 * k]
+            s.g[k], s.tau[k] = given[1 + 2 * k], given[2 + 2 * k]
         sum_gain(c, i)
         row = past(s, c.row)
         for k in range(own, width):
             row[k - own] = given[k]
-        call_begin(n.begin, row, s)
+        contract.call_begin(n.begin, row, s)
         given = past(given, width)
     for g in range(c.groups):
         c.per_mass[g] = 1.0 / heavy[g]

@@ -8,30 +8,11 @@ from __future__ import annotations
 
 import math
 
-from numba import types
-
 from foamfit.solve.compiled.motion import dense, rates_of
-from foamfit.solve.compiled.run import BATCH, RECORD, numbers, spring, unpack
+from foamfit.solve.compiled.run import BATCH, numbers, sampling, spring
 from foamfit.solve.scene import FREE, MOTION
-from foamfit.springs.compiled.contract import (
-    BY,
-    BY_HELD,
-    BY_STRESS,
-    INTERNAL,
-    OF_LAW,
-    REAL,
-    REALS_AT,
-    RELAX,
-    SLOPE,
-    WHOLE,
-    WHOLES_AT,
-    call_evaluate,
-    calling,
-    inlined,
-    inner,
-    past,
-    pointed,
-)
+from foamfit.springs.compiled import contract
+from foamfit.springs.compiled.contract import inlined, inner, past
 from foamfit.springs.laws.record import BEGUN, OWN_ETA, OWN_RELAXATION, STRUCK
 
 # Tasks, instead of the number of a sample: write those up to a time inside the step, those after
@@ -42,13 +23,13 @@ KNOWN = -1  # instead of whether with derivatives, if all values are those of th
 
 
 @inlined
-def row_of(c, q, node):  # type: ignore[no-untyped-def]
+def row_of(c, q, node):
     """Return the samples of the response (q = 0) or of a derivative; node 0 is the base stress."""
     return past(c.out, (q * c.shown + node) * c.samples)
 
 
 @inner
-def place_nodes(c, g, y, reach):  # type: ignore[no-untyped-def]
+def place_nodes(c, g, y, reach):
     """Fill displacement and derivatives `reach` of the node below a group; return the first."""
     for j in range(c.p):
         reach[j] = y[c.base + 2 * (g - 1) * c.p + j] if g > 0 else 0.0
@@ -56,7 +37,7 @@ def place_nodes(c, g, y, reach):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _rise(c, i, reach):  # type: ignore[no-untyped-def]
+def _rise(c, i, reach):
     """Add the elongation of a spring to derivatives of a displacement; return the elongation."""
     s, p = spring(c, i), c.p
     strain, own, height, eps = past(c.strain, i * p), past(c.own, 2 * i * p), s.height, s.eps
@@ -66,7 +47,7 @@ def _rise(c, i, reach):  # type: ignore[no-untyped-def]
 
 
 @inner
-def is_finite(c, rows):  # type: ignore[no-untyped-def]
+def is_finite(c, rows):
     """Whether all samples of the first rows of the response are finite."""
     out, fine = c.out, c.none
     for k in range(rows * c.samples):
@@ -75,7 +56,7 @@ def is_finite(c, rows):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _put(c, node, k, value, slopes):  # type: ignore[no-untyped-def]
+def _put(c, node, k, value, slopes):
     """Write a sample of a row and its derivatives."""
     row_of(c, c.none, node)[k] = value
     for j in range(c.p):
@@ -83,7 +64,7 @@ def _put(c, node, k, value, slopes):  # type: ignore[no-untyped-def]
 
 
 @inner
-def write_sample(c, y, at, k, want):  # type: ignore[no-untyped-def]
+def write_sample(c, y, at, k, want):
     """Write sample k from a state at a time since the piece began.
 
     The values of all springs are KNOWN or computed, with derivatives if they are wanted.
@@ -95,12 +76,12 @@ def write_sample(c, y, at, k, want):  # type: ignore[no-untyped-def]
     _put(c, c.none, k, c.carried[0], c.common)
     for g in range(c.none if every else last, c.groups):
         solved = g < c.nodes
-        top = c.ends[g] if every else c.shown - 1
+        top = c.first[g + 1] if every else c.shown - 1
         if every or not (solved or c.top == MOTION):
             if g > 0 and want != KNOWN:
                 rates_of(c, g, y, c.f, want, at)
             place = place_nodes(c, g, y, reach)
-            for i in range(c.ends[g - 1] if g > 0 else c.none, c.ends[g]):
+            for i in range(c.first[g], c.first[g + 1]):
                 place += _rise(c, i, reach)
                 if every or i == c.count - 1:
                     _put(c, 1 + i if every else top, k, place, reach)
@@ -114,7 +95,7 @@ def write_sample(c, y, at, k, want):  # type: ignore[no-untyped-def]
 
 
 @inner
-def polynomial(c, i, n, out):  # type: ignore[no-untyped-def]
+def polynomial(c, i, n, out):
     """Fill component i of the state at the n shares in `batch` of an explicit step."""
     line, wide, shares = c.line, c.wide, c.batch
     a, b, d, e = line[i], line[wide + i], line[2 * wide + i], line[3 * wide + i]
@@ -126,7 +107,7 @@ def polynomial(c, i, n, out):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _write_batch(c, at, n):  # type: ignore[no-untyped-def]
+def _write_batch(c, at, n):
     """Write n samples from `at` on: base stress of one spring, which is alone, and the top."""
     s, own, top = spring(c, 0), numbers(c, 0), 2 * c.groups - 2
     shares, time = c.batch, c.time
@@ -140,8 +121,8 @@ def _write_batch(c, at, n):  # type: ignore[no-untyped-def]
         eps[k] = w[k] * per
     if own.x_at >= 0:
         polynomial(c, own.x_at, n, x)
-    call_evaluate(own.evaluate, past(s, c.row), s, eps, x, n, int(c.p > 0), found)
-    sigma, stress = past(found, OF_LAW * n), past(row_of(c, c.none, c.none), at)
+    contract.call_evaluate(own.evaluate, past(s, c.row), s, eps, x, n, int(c.p > 0), found)
+    sigma, stress = past(found, contract.OF_LAW * n), past(row_of(c, c.none, c.none), at)
     for k in range(n):
         stress[k] = gain * sigma[k]
     if eta > 0.0:
@@ -151,7 +132,7 @@ def _write_batch(c, at, n):  # type: ignore[no-untyped-def]
     for q in range(c.terms):
         polynomial(c, own.z_at + q, n, work)
         for k in range(n):
-            stress[k] += s[RELAX + 2 * q] * work[k]
+            stress[k] += s.g[q] * work[k]
     if top > 0:
         polynomial(c, top, n, w)
     motion = past(row_of(c, c.none, c.none + 1), at)
@@ -162,13 +143,13 @@ def _write_batch(c, at, n):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _write_slope(c, j, at, n):  # type: ignore[no-untyped-def]
+def _write_slope(c, j, at, n):
     """Write derivative j of the samples of `_write_batch`."""
     s, own, p, top = spring(c, 0), numbers(c, 0), c.p, 2 * c.groups - 2
     shares = c.batch
     eps, work, v = past(shares, BATCH), past(shares, 3 * BATCH), past(shares, 5 * BATCH)
     found = past(shares, 6 * BATCH)
-    slope, sigma = past(found, SLOPE * n), past(found, OF_LAW * n)
+    slope, sigma = past(found, contract.SLOPE * n), past(found, contract.OF_LAW * n)
     stress, motion = past(row_of(c, 1 + j, c.none), at), past(row_of(c, 1 + j, c.none + 1), at)
     per, eta, gain, what = s.per_height, s.eta, s.gain, c.directions[2 * j + 1]
     mine, of_height, of_eta = c.directions[2 * j] == 0, c.own[j], c.own[p + j]
@@ -177,11 +158,11 @@ def _write_slope(c, j, at, n):  # type: ignore[no-untyped-def]
         motion[k] = work[k]
         stress[k] = gain * slope[k] * per * (work[k] - of_height * eps[k])
     if mine and 0 <= what < OWN_ETA:
-        by = past(found, (BY + what) * n)
+        by = past(found, (contract.BY + what) * n)
         for k in range(n):
             stress[k] += gain * by[k]
-    if own.kind == BY_STRESS:
-        held, ever, by = gain * c.held[j], gain * c.held[p + j], past(found, BY_HELD * n)
+    if own.by_stress:
+        held, ever, by = gain * c.held[j], gain * c.held[p + j], past(found, contract.BY_HELD * n)
         for k in range(n):
             stress[k] += held * by[k] + ever * by[n + k]
     if eta > 0.0 or of_eta > 0.0:
@@ -192,7 +173,7 @@ def _write_slope(c, j, at, n):  # type: ignore[no-untyped-def]
     for q in range(c.terms):
         polynomial(c, c.base + (own.z_at + q) * p + j, n, work)
         for k in range(n):
-            stress[k] += s[RELAX + 2 * q] * work[k]
+            stress[k] += s.g[q] * work[k]
         if mine and what == OWN_RELAXATION + 2 * q:
             polynomial(c, own.z_at + q, n, work)
             for k in range(n):
@@ -202,11 +183,11 @@ def _write_slope(c, j, at, n):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _write_inside(c, reached, want):  # type: ignore[no-untyped-def]
+def _write_inside(c, reached, want):
     """Write the samples of an impact up to a time inside the step."""
     r, t, n = c.now, c.time, c.base + c.carries * c.p
-    k, quick = int(r.sample), c.shown == 2 and c.ends[0] == 1 and c.top == FREE and c.degree == 0
-    if quick and c.numbers.kind != INTERNAL:
+    k, quick = int(r.sample), c.shown == 2 and c.first[1] == 1 and c.top == FREE and c.degree == 0
+    if quick and not c.numbers.internal:
         while k < c.samples and t[k] <= reached:
             last = k + 1
             while last < c.samples and last - k < BATCH and t[last] <= reached:
@@ -224,7 +205,7 @@ def _write_inside(c, reached, want):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _coast(c, row, first, last, since, place, speed, pull):  # type: ignore[no-untyped-def]
+def _coast(c, row, first, last, since, place, speed, pull):
     """Write samples of a uniformly accelerated motion."""
     for k in range(first, last):
         dt = c.time[k] - since
@@ -232,7 +213,7 @@ def _coast(c, row, first, last, since, place, speed, pull):  # type: ignore[no-u
 
 
 @inner
-def _approach(c, speed):  # type: ignore[no-untyped-def]
+def _approach(c, speed):
     """Write the samples before contact, when only the striker moves."""
     done = c.none
     while done < c.samples and c.time[done] < 0.0:
@@ -252,7 +233,7 @@ def _approach(c, speed):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _fly(c, slope):  # type: ignore[no-untyped-def]
+def _fly(c, slope):
     """Write the samples after the end of contact; `slope` is dS/dt there.
 
     The chain moves with the striker. Derivatives include the shift of the end of contact.
@@ -264,10 +245,10 @@ def _fly(c, slope):  # type: ignore[no-untyped-def]
     reach = past(c.common, (c.groups + 1) * p)
     for g in range(c.groups):
         place, quick = place_nodes(c, g, y, reach), y[2 * g - 1] if g > 0 else 0.0
-        for i in range(c.ends[g - 1] if g > 0 else c.none, c.ends[g]):
+        for i in range(c.first[g], c.first[g + 1]):
             place += _rise(c, i, reach)
             quick += spring(c, i).height * spring(c, i).rate
-            if i == c.ends[g] - 1:
+            if i == c.first[g + 1] - 1:
                 place, quick = y[2 * g], y[2 * g + 1]
                 for j in range(p):
                     reach[j] = y[c.base + 2 * g * p + j]
@@ -283,13 +264,9 @@ def _fly(c, slope):  # type: ignore[no-untyped-def]
                 _coast(c, row_of(c, j, node), first, c.samples, now, at, fast, more)
 
 
-# ---------------------------------------------------------------- called by address
-
-
-@pointed(types.void(WHOLES_AT, REALS_AT, REAL, WHOLE, WHOLE))
-def sample_task(words, y, at, k, want):  # type: ignore[no-untyped-def]
+@sampling
+def sample_task(c, y, at, k, want):
     """Do what `write` is asked for."""
-    c = unpack(words)
     if k == INSIDE:
         _write_inside(c, at, want)
     elif k == FLIGHT:
@@ -298,12 +275,3 @@ def sample_task(words, y, at, k, want):  # type: ignore[no-untyped-def]
         _approach(c, at)
     else:
         write_sample(c, y, at, k, want)
-
-
-_call_samples = calling(types.void, RECORD, REALS_AT, REAL, WHOLE, WHOLE)
-
-
-@inlined
-def write(c, y, at, k, want):  # type: ignore[no-untyped-def]
-    """Write sample k from a state at a time since the piece began, or do a task: INSIDE, …"""
-    _call_samples(c.write_at, c, y, at, k, want)

@@ -14,12 +14,11 @@ import math
 
 from foamfit.solve.compiled.along import TABLE, integral, tabulate
 from foamfit.solve.compiled.events import MIDDLE, suspicious
-from foamfit.solve.compiled.explicit import SHORTENING
 from foamfit.solve.compiled.motion import ONLY_DERIVATIVES, evaluate, rates, rates_of
-from foamfit.solve.compiled.run import STEPPED, numbers, spring, sum_gain, unpack
+from foamfit.solve.compiled.run import STEPPED, numbers, shortening, spring, sum_gain
 from foamfit.solve.compiled.static import strain_at
 from foamfit.solve.scene import STRESS
-from foamfit.springs.compiled.contract import RELAX, inner, past, pointed
+from foamfit.springs.compiled.contract import inner, past
 from foamfit.springs.laws.record import OWN_RELAXATION
 
 # Memory of a spring, see `layout`: stress, slope and strain rate at the start of a step, and the
@@ -45,13 +44,13 @@ RISE, EARLY, LATE = (
 
 
 @inner
-def _memory(c, i):  # type: ignore[no-untyped-def]
+def _memory(c, i):
     """Return the memory of a spring."""
     return past(c.aside, i * (TABLES + c.terms * TABLE))
 
 
 @inner
-def _keep(c):  # type: ignore[no-untyped-def]
+def _keep(c):
     """Keep the values at the start of a step; return whether no spring is on a flat branch."""
     steep = True
     for i in range(c.count):
@@ -62,7 +61,7 @@ def _keep(c):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _prepare(c, h):  # type: ignore[no-untyped-def]
+def _prepare(c, h):
     """Fill what the terms at the end of a step owe to its start, and gain and offset of each T."""
     y, new, p = c.y, c.new, c.p
     for i in range(c.count):
@@ -70,8 +69,8 @@ def _prepare(c, h):  # type: ignore[no-untyped-def]
         s.gain, s.offset, low = 1.0, 0.0, m[STEEP] * m[RATE] * h
         part, strain, slope = past(c.part, i * p), past(c.strain, i * p), m[STEEP]
         for k in range(c.terms):
-            g, a, at = s[RELAX + 2 * k], past(m, TABLES + k * TABLE), n.z_at + k
-            x = h / s[RELAX + 2 * k + 1]
+            g, a, at = s.g[k], past(m, TABLES + k * TABLE), n.z_at + k
+            x = h / s.tau[k]
             tabulate(x, h, a)
             decay = math.exp(-x)
             new[at] = decay * y[at] - x * (m[FIRST] * (a[0] - a[2]) + low * (a[1] - a[2]))
@@ -83,7 +82,7 @@ def _prepare(c, h):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _restore(c):  # type: ignore[no-untyped-def]
+def _restore(c):
     """Give the springs back their own gains."""
     for i in range(c.count):
         spring(c, i).offset = 0.0
@@ -91,7 +90,7 @@ def _restore(c):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _balance(c, h, guess, near):  # type: ignore[no-untyped-def]
+def _balance(c, h, guess, near):
     """Fill strains and stresses at the end of a step, and the terms; return the common stress.
 
     The result is not a number if Newton's method does not converge at once, as in a narrow snap.
@@ -120,13 +119,13 @@ def _balance(c, h, guess, near):  # type: ignore[no-untyped-def]
         if n.x_at >= 0:
             new[n.x_at] = m[LAST]
         for k in range(c.terms):
-            x = h / s[RELAX + 2 * k + 1]
+            x = h / s.tau[k]
             new[n.z_at + k] -= x * m[TABLES + k * TABLE + 2] * m[LAST]
     return common if off <= 0.0 else math.nan
 
 
 @inner
-def _correct(c, h, want, tol, common):  # type: ignore[no-untyped-def]
+def _correct(c, h, want, tol, common):
     """Add the cubic terms; return the largest error over the one that is allowed."""
     y, new, error, balanced = c.y, c.new, 0.0, True
     least = PARABOLA * tol**POWER if want else math.inf
@@ -140,8 +139,8 @@ def _correct(c, h, want, tol, common):  # type: ignore[no-untyped-def]
         square = m[LAST] - m[FIRST] - low
         cube = s.slope * s.rate * h - low - 2.0 * square
         for k in range(c.terms):
-            g, a, at = s[RELAX + 2 * k], past(m, TABLES + k * TABLE), n.z_at + k
-            x = h / s[RELAX + 2 * k + 1]
+            g, a, at = s.g[k], past(m, TABLES + k * TABLE), n.z_at + k
+            x = h / s.tau[k]
             more, bend = x * cube * (a[2] - a[3]), x * square * (a[1] - a[2])
             size = max(c.scales[c.kinds[at]], max(abs(y[at]), abs(new[at])))
             new[at] += more
@@ -153,7 +152,7 @@ def _correct(c, h, want, tol, common):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _derive(c, h):  # type: ignore[no-untyped-def]
+def _derive(c, h):
     """Fill the derivatives of the relaxation terms at the end of a step."""
     new, p = c.new, c.p
     for i in range(c.count):
@@ -162,9 +161,9 @@ def _derive(c, h):  # type: ignore[no-untyped-def]
         first, low = m[FIRST], m[STEEP] * m[RATE] * h
         square = m[LAST] - first - low
         for k in range(c.terms):
-            a, tau, at = past(m, TABLES + k * TABLE), s[RELAX + 2 * k + 1], n.z_at + k
+            a, tau, at = past(m, TABLES + k * TABLE), s.tau[k], n.z_at + k
             x, after, what = h / tau, past(new, c.base + at * p), OWN_RELAXATION + 2 * k + 1
-            s.gain -= s[RELAX + 2 * k] * x * a[1]
+            s.gain -= s.g[k] * x * a[1]
             total = integral(a, first, low, square, 0.0, 0.0)
             change = integral(past(a, 1), first, low, square, 0.0, 0.0) - total
             for j in range(p):
@@ -176,14 +175,14 @@ def _derive(c, h):  # type: ignore[no-untyped-def]
         part, strain = past(c.part, i * p), past(c.strain, i * p)
         for k in range(c.terms):
             after = past(new, c.base + (n.z_at + k) * p)
-            weight = h / s[RELAX + 2 * k + 1] * m[TABLES + k * TABLE + 1]
+            weight = h / s.tau[k] * m[TABLES + k * TABLE + 1]
             for j in range(p):
                 after[j] -= weight * (s.slope * strain[j] + part[j])
     _restore(c)
 
 
 @inner
-def _try(c, h, want, tol, guess):  # type: ignore[no-untyped-def]
+def _try(c, h, want, tol, guess):
     """Fill the state at the end of a step; return the largest error over the one allowed."""
     _prepare(c, h)
     common = _balance(c, h, guess, min(NEAR, CLOSE * tol))
@@ -192,10 +191,9 @@ def _try(c, h, want, tol, guess):  # type: ignore[no-untyped-def]
     return _correct(c, h, want, tol, common)
 
 
-@pointed(SHORTENING)
-def relaxing_step(words, want, tol):  # type: ignore[no-untyped-def]
+@shortening
+def relaxing_step(c, want, tol):
     """Try one step up to the next sample, or a shorter one; return whether it was taken."""
-    c = unpack(words)
     r, s, first, rest = c.now, c.springs, c.carried[0], c.now.horizon - c.now.now
     climb = s.gain * s.slope * s.rate + s.drift  # rate of the common stress
     r.paused -= 1.0

@@ -9,35 +9,34 @@ from __future__ import annotations
 
 import math
 
-from foamfit.solve.compiled.events import change_branch
 from foamfit.solve.compiled.motion import ONLY_DERIVATIVES, evaluate, in_contact, rates_of
-from foamfit.solve.compiled.run import begin_run, numbers, spring
+from foamfit.solve.compiled.run import begin_run, change_branch, numbers, spring
 from foamfit.solve.compiled.samples import KNOWN, is_finite, write_sample
 from foamfit.solve.scene import MOTION, STRESS
-from foamfit.springs.compiled.contract import BY_STRESS, call_number, inner, outer, past
+from foamfit.springs.compiled.contract import call_number, inner, outer, past
 
 LEAST = 1e-6  # strain to whose rounding error elongations are always resolved
 MOST_SWITCHES = 100_000  # of all springs between two samples
 
 
 @inner
-def put(c, i, eps, sigma):  # type: ignore[no-untyped-def]
+def put(c, i, eps, sigma):
     """Bring a spring to a strain and stress of its branch."""
     s = spring(c, i)
     s.eps = eps
-    if numbers(c, i).kind == BY_STRESS:
+    if numbers(c, i).by_stress:
         s.x = (sigma - s.offset) / s.gain
 
 
 @inner
-def strain_at(c, i, sigma):  # type: ignore[no-untyped-def]
+def strain_at(c, i, sigma):
     """Return the strain of a spring at a stress T on its branch; fill SOFT."""
     s, n = spring(c, i), numbers(c, i)
     return call_number(n.strain, past(s, c.row), s, (sigma - s.offset) / s.gain)
 
 
 @inner
-def elongation_at(c, i0, i1, sigma, loose):  # type: ignore[no-untyped-def]
+def elongation_at(c, i0, i1, sigma, loose):
     """Bring springs to a stress on their branches; return elongation, compliance, size of terms.
 
     With `loose`, only the springs without a dashpot.
@@ -56,7 +55,7 @@ def elongation_at(c, i0, i1, sigma, loose):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _split_jump(c, i0, i1, target, low, high, loose):  # type: ignore[no-untyped-def]
+def _split_jump(c, i0, i1, target, low, high, loose):
     """Distribute an elongation inside a jump between two stresses from the base up."""
     reached, _, _ = elongation_at(c, i0, i1, low, loose)
     rest = target - reached
@@ -72,7 +71,7 @@ def _split_jump(c, i0, i1, target, low, high, loose):  # type: ignore[no-untyped
 
 
 @inner
-def root(c, i0, i1, target, sigma, low, high, end, loose):  # type: ignore[no-untyped-def]
+def root(c, i0, i1, target, sigma, low, high, end, loose):
     """Bring springs to an elongation; return the stress, and whether the root lies beyond `end`.
 
     Newton's method inside a bracket of stresses, which every third trial halves. The root may lie
@@ -115,7 +114,7 @@ def root(c, i0, i1, target, sigma, low, high, end, loose):  # type: ignore[no-un
 
 
 @inner
-def push_to(c, i, sigma, before, y):  # type: ignore[no-untyped-def]
+def push_to(c, i, sigma, before, y):
     """Bring a spring to a stress, from the stress `before`."""
     s, way = spring(c, i), 1.0 if sigma > before else -1.0
     for _ in range(MOST_SWITCHES):
@@ -131,7 +130,7 @@ def push_to(c, i, sigma, before, y):  # type: ignore[no-untyped-def]
 
 
 @inner
-def elongation(c, i0, i1):  # type: ignore[no-untyped-def]
+def elongation(c, i0, i1):
     """Return the elongation of springs at their present strains."""
     total = 0.0
     for i in range(i0, i1):
@@ -141,7 +140,7 @@ def elongation(c, i0, i1):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _yield_flat(c, i0, i1, rest, y):  # type: ignore[no-untyped-def]
+def _yield_flat(c, i0, i1, rest, y):
     """Let springs on flat branches take an elongation, from the base up; return what is left.
 
     One that reaches the end of its branch leaves it; the second value says so.
@@ -161,7 +160,7 @@ def _yield_flat(c, i0, i1, rest, y):  # type: ignore[no-untyped-def]
 
 
 @inner
-def bring(c, i0, i1, target, common, y):  # type: ignore[no-untyped-def]
+def bring(c, i0, i1, target, common, y):
     """Bring springs in series to an elongation, from a common stress; return that stress."""
     for _ in range(MOST_SWITCHES):
         rest = target - elongation(c, i0, i1)
@@ -203,19 +202,7 @@ def bring(c, i0, i1, target, common, y):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _bring_all(c, k, before):  # type: ignore[no-untyped-def]
-    """Bring the chain to sample k of its drive, from a common stress; return that stress."""
-    now = c.values[k]
-    if c.top == STRESS:
-        for i in range(c.count):
-            push_to(c, i, now, before, c.y)
-    else:
-        now = bring(c, c.none, c.count, now, before, c.y)
-    return now
-
-
-@inner
-def _write(c, k, now):  # type: ignore[no-untyped-def]
+def _write(c, k, now):
     """Write sample k: the common stress, displacements, and their derivatives."""
     c.carried[0], c.drive.value, c.drive.shift = now, c.values[k], in_contact(c, k)
     if c.p > 0:
@@ -228,9 +215,7 @@ def _write(c, k, now):  # type: ignore[no-untyped-def]
 
 
 @outer
-def balance(  # type: ignore[no-untyped-def]
-    ints, floats, rows, heights, mass, reals, values, time, out, log, history
-):  # fmt: skip
+def balance(ints, floats, rows, heights, mass, reals, values, time, out, log, history):
     """Follow undamped, massless springs in series along a motion or stress of the top.
 
     `history` (2, springs, n) becomes strains and branches. Return the largest error of an
@@ -241,8 +226,13 @@ def balance(  # type: ignore[no-untyped-def]
     for i in range(c.count):
         evaluate(c, i, int(c.p > 0))
     for k in range(c.samples):
-        before = _bring_all(c, k, before)
-        _write(c, k, before)
+        now = c.values[k]
+        if c.top == MOTION:
+            now = bring(c, c.none, c.count, now, before, c.y)
+        for i in range(c.count if c.top == STRESS else c.none):
+            push_to(c, i, now, before, c.y)
+        _write(c, k, now)
+        before = now
         for i in range(c.count):
             s = spring(c, i)
             history[0, i, k], history[1, i, k] = s.eps, s.branch

@@ -3,26 +3,13 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 from numba import njit
 
-from foamfit.springs.compiled.contract import (
-    BY,
-    EXPLICIT,
-    MISS,
-    OF_LAW,
-    OPTIONS,
-    SLOPE,
-    Compiled,
-    beginning,
-    evaluating,
-    inner,
-    inverting,
-    past,
-    settling,
-    start,
-    switching,
-)
+from foamfit.arrays import Array
+from foamfit.springs.compiled import contract
+from foamfit.springs.compiled.contract import BY, MISS, OF_LAW, SLOPE, Compiled, inner, past, start
 from foamfit.springs.law import admissible, derived_points
 
 # Branches; LINE and OPEN of linear springs. OPEN is that of a unilateral one out of contact.
@@ -36,8 +23,8 @@ COLUMNS = TABLE + 4 * WIDE
 _admissible, _derived_points = inner(admissible), inner(derived_points)
 
 
-@njit(**OPTIONS, cache=True)
-def fill(given, array):  # type: ignore[no-untyped-def]
+@njit(**contract.OPTIONS, cache=True)
+def fill(given, array):
     """Write the row of the seven parameters."""
     values, row = start(given), start(array)
     k0, kc, dsigma, eps_a = values[0], values[1], values[2], values[3]
@@ -75,8 +62,8 @@ def fill(given, array):  # type: ignore[no-untyped-def]
     return True
 
 
-@evaluating
-def evaluate(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
+@contract.evaluating
+def evaluate(row, s, eps, x, count, want, out):
     branch = s.branch
     line = past(row, TABLE + int(branch) * WIDE)
     sigma, slope = past(out, OF_LAW * count), past(out, SLOPE * count)
@@ -102,7 +89,7 @@ def evaluate(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _enter(row, s, branch):  # type: ignore[no-untyped-def]
+def _enter(row, s, branch):
     """Enter a branch."""
     s.branch = branch
     s.low, s.high, s.sigma_low, s.sigma_high = -math.inf, math.inf, -math.inf, math.inf
@@ -114,8 +101,8 @@ def _enter(row, s, branch):  # type: ignore[no-untyped-def]
         s.high, s.sigma_high = row[high], row[TO_STRESS + high]
 
 
-@switching
-def switch(row, s, up, out):  # type: ignore[no-untyped-def]
+@contract.switching
+def switch(row, s, up, out):
     s.eps = s.high if up else s.low
     if up:
         _enter(row, s, D if s.branch == A else C)
@@ -124,21 +111,21 @@ def switch(row, s, up, out):  # type: ignore[no-untyped-def]
     return 0.0
 
 
-@beginning
-def begin(row, s):  # type: ignore[no-untyped-def]
+@contract.beginning
+def begin(row, s):
     s.turns = 0.0
     _enter(row, s, A)
     return 0.0
 
 
-@settling
-def settle(row, s, eps):  # type: ignore[no-untyped-def]
+@contract.settling
+def settle(row, s, eps):
     s.eps = eps
     return 0.0
 
 
-@inverting
-def strain(row, s, sigma):  # type: ignore[no-untyped-def]
+@contract.inverting
+def strain(row, s, sigma):
     branch = s.branch
     line = past(row, TABLE + int(branch) * WIDE)
     k, origin = line[0], line[1]
@@ -153,49 +140,33 @@ def strain(row, s, sigma):  # type: ignore[no-untyped-def]
     return origin + (sigma - line[2]) / k if k > 0.0 else s.low
 
 
-COMPILED = Compiled(
-    fill,
-    EXPLICIT,
-    COLUMNS,
-    7,
-    0,
-    (begin.address, evaluate.address, switch.address, settle.address, strain.address),
-    (TABLE + A * WIDE, TABLE + C * WIDE, TABLE + D * WIDE),
-    TABLE + C * WIDE + 1,
-)
+_FUNCTIONS = (begin, evaluate, switch, settle, strain)
+_SLOPES = (TABLE + A * WIDE, TABLE + C * WIDE, TABLE + D * WIDE)
+_STAR = TABLE + C * WIDE + 1
+COMPILED = Compiled(fill, contract.EXPLICIT, COLUMNS, 7, 0, _FUNCTIONS, _SLOPES, _STAR)
 
 
 # ---------------------------------------------------------------- linear springs
 
 
-@njit(**OPTIONS, cache=True)
-def fill_linear(values, row):  # type: ignore[no-untyped-def]
-    """Write k0, and 0: the spring carries tension."""
-    row[0], row[1] = values[0], 0.0
-    return 0.0 < values[0] < math.inf
+def fill_line(opens: float, values: Array, row: Array) -> bool:
+    """Write k0, and 1 if the spring carries no tension, else 0."""
+    row[0], row[1] = values[0], opens
+    return bool(0.0 < values[0] < math.inf)
 
 
-@njit(**OPTIONS, cache=True)
-def fill_unilateral(values, row):  # type: ignore[no-untyped-def]
-    """Write k0, and 1: the spring carries no tension."""
-    row[0], row[1] = values[0], 1.0
-    return 0.0 < values[0] < math.inf
-
-
-@evaluating
-def evaluate_linear(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
+@contract.evaluating
+def evaluate_linear(row, s, eps, x, count, want, out):
     touches = 1.0 if s.branch == LINE else 0.0
+    k = touches * row[0]
     for j in range(count):
-        out[OF_LAW * count + j], out[SLOPE * count + j] = (
-            touches * row[0] * eps[j],
-            touches * row[0],
-        )
+        out[OF_LAW * count + j], out[SLOPE * count + j] = k * eps[j], k
         out[MISS * count + j], out[BY * count + j] = 0.0, touches * eps[j]
     return 0.0
 
 
 @inner
-def _enter_line(row, s, branch):  # type: ignore[no-untyped-def]
+def _enter_line(row, s, branch):
     """Enter a branch of a linear spring."""
     s.branch, s.low, s.sigma_low, s.high, s.sigma_high = (
         branch, -math.inf, -math.inf, math.inf, math.inf,
@@ -206,22 +177,22 @@ def _enter_line(row, s, branch):  # type: ignore[no-untyped-def]
         s.low, s.sigma_low = 0.0, 0.0
 
 
-@switching
-def switch_linear(row, s, up, out):  # type: ignore[no-untyped-def]
+@contract.switching
+def switch_linear(row, s, up, out):
     s.eps = 0.0
     _enter_line(row, s, LINE if up else OPEN)
     return 0.0
 
 
-@beginning
-def begin_linear(row, s):  # type: ignore[no-untyped-def]
+@contract.beginning
+def begin_linear(row, s):
     s.turns = 0.0
     _enter_line(row, s, LINE)
     return 0.0
 
 
-@inverting
-def strain_linear(row, s, sigma):  # type: ignore[no-untyped-def]
+@contract.inverting
+def strain_linear(row, s, sigma):
     if s.branch == OPEN:
         s.soft = math.inf
         return 0.0 if sigma >= 0.0 else -math.inf
@@ -229,9 +200,6 @@ def strain_linear(row, s, sigma):  # type: ignore[no-untyped-def]
     return sigma / row[0]
 
 
-_LINEAR = (
-    begin_linear.address, evaluate_linear.address, switch_linear.address, settle.address,
-    strain_linear.address,
-)  # fmt: skip
-LINEAR = Compiled(fill_linear, EXPLICIT, 2, 1, 0, _LINEAR, (0,))
-UNILATERAL = Compiled(fill_unilateral, EXPLICIT, 2, 1, 0, _LINEAR, (0,))
+_LINE = (begin_linear, evaluate_linear, switch_linear, settle, strain_linear)
+LINEAR = Compiled(partial(fill_line, 0.0), contract.EXPLICIT, 2, 1, 0, _LINE, (0,))
+UNILATERAL = Compiled(partial(fill_line, 1.0), contract.EXPLICIT, 2, 1, 0, _LINE, (0,))

@@ -40,7 +40,8 @@ the last point, at fixed strain, by dx (`x`) and, unless `count` is negative, by
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from inspect import Parameter, Signature
 from pathlib import Path
@@ -87,7 +88,8 @@ EXPLICIT, BY_STRESS, INTERNAL = range(3)
 PATHS, DIRECTION = 2, 3
 BY_STRAIN, ALONG_A, ALONG_B, BY_RATE = range(1, 5)  # rows; the last has one number
 STILL, FADES, FLOWS = range(3)  # internal variables and V: nothing, x decays, or anything else
-WANTED, DERIVED, AT_STRAIN, AT_RATE, ON_BRANCH, POINT = range(6)  # POINT: length without x
+_LAST = ("wanted", "derived", "eps", "rate", "branch")  # of the last point; then x
+POINT = len(_LAST)
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy", "fastmath": {"contract"}, "no_rewrites": True,
 }  # fmt: skip
@@ -110,12 +112,12 @@ REAL, WHOLE = types.float64, types.int64
 REALS_AT, WHOLES_AT = types.CPointer(REAL), types.CPointer(WHOLE)
 
 
+@dataclass(frozen=True, eq=False)
 class Pointed:
     """A function that others call by its address; it is compiled when this is first asked for."""
 
-    def __init__(self, signature: Any, function: Callable[..., Any]) -> None:
-        """Give the function and its signature."""
-        self.signature, self.function = signature, function
+    signature: Any
+    function: Callable[..., Any]
 
     @cached_property
     def compiled(self) -> Any:
@@ -128,18 +130,17 @@ class Pointed:
         return int(self.compiled.address)
 
 
-def pointed(signature: Any) -> Callable[[Callable[..., Any]], Pointed]:
-    """Return a decorator for a function of this signature."""
-    return partial(Pointed, signature)
-
-
 class Named(types.CPointer):  # type: ignore[misc]
-    """A pointer to numbers some of which have a name: `s.eps` is `s[EPS]`."""
+    """A pointer to numbers some of which have a name: `s.eps` is `s[EPS]`.
 
-    def __init__(self, name: str, kind: Any, places: Mapping[str, int]) -> None:
-        """Give the names of numbers with their places."""
+    Those of `arrays` are pointers to the numbers from a place on: `s.g[k]` is `s[RELAX + k]`.
+    """
+
+    def __init__(self, name: str, kind: Any, places: Mapping[str, int], **arrays: int) -> None:
+        """Give the names of numbers, and of arrays, with their places."""
         super().__init__(kind)
-        self.name, self.places = f"foamfit.{name}", dict(places)
+        self.name, self.places = f"foamfit.{name}", {**places, **arrays}
+        self.arrays = frozenset(arrays)
 
     @property
     def key(self) -> str:
@@ -157,7 +158,9 @@ class _Names(AttributeTemplate):  # type: ignore[misc]
     key = Named
 
     def generic_resolve(self, pointer: Any, name: str) -> Any:
-        """Return the type of a named number, or None if the name is unknown."""
+        """Return the type of a named number or array, or None if the name is unknown."""
+        if name in pointer.arrays:
+            return types.CPointer(pointer.dtype)
         return pointer.dtype if name in pointer.places else None
 
 
@@ -166,12 +169,13 @@ def _place(builder: Any, kind: Any, pointer: Any, name: str) -> Any:
 
 
 @lower_getattr_generic(Named)
-def _load(context, builder, kind, pointer, name):  # type: ignore[no-untyped-def]
-    return builder.load(_place(builder, kind, pointer, name))
+def _load(context, builder, kind, pointer, name):
+    place = _place(builder, kind, pointer, name)
+    return place if name in kind.arrays else builder.load(place)
 
 
 @lower_setattr_generic(Named)
-def _store(context, builder, signature, args, name):  # type: ignore[no-untyped-def]
+def _store(context, builder, signature, args, name):
     return builder.store(args[1], _place(builder, signature.args[0], args[0], name))
 
 
@@ -183,11 +187,14 @@ SPRING = Named(
         for first, names in zip(_FIRST, SPRING_FIELDS, strict=True)
         for k, name in enumerate(names)
     },
+    point=EPS,
+    xs=X,
+    g=RELAX,
+    tau=RELAX + MOST_TERMS,
+    results=RESULTS,
+    by_held=RESULTS + BY_HELD,
+    by=RESULTS + BY,
 )
-evaluating = pointed(REAL(REALS_AT, SPRING, REALS_AT, REALS_AT, WHOLE, WHOLE, REALS_AT))
-switching = pointed(REAL(REALS_AT, SPRING, WHOLE, REALS_AT))
-beginning = pointed(REAL(REALS_AT, SPRING))
-settling = inverting = pointed(REAL(REALS_AT, SPRING, REAL))
 
 
 class Compiled(NamedTuple):
@@ -198,12 +205,17 @@ class Compiled(NamedTuple):
     columns: int  #: of a row
     derivatives: int  #: number of parameters, by which `evaluate` gives derivatives
     internal: int  #: number of internal variables
-    addresses: tuple[int, int, int, int, int]  #: begin, evaluate, switch, settle, strain
+    functions: tuple[Any, ...]  #: begin, evaluate, switch, settle, strain
     #: columns of the row with slopes dσ/dε (Pa) of branches at zero stress, that at rest first
     slopes: tuple[int, ...] = ()
     pole: int = -1  #: column of the row with ε_*, if the strain stays below 1 + ε_*
     least_eta: float = 0.0  #: TINY if V depends on the strain rate, Pa·s
     flows: int = 0  #: how the state changes within a branch: STILL, FADES or FLOWS
+
+    @property
+    def addresses(self) -> tuple[int, ...]:
+        """The addresses of its functions, which are compiled if they have not been."""
+        return tuple(one.address for one in self.functions)
 
 
 EVALUATE = 1  #: place among the addresses
@@ -218,42 +230,42 @@ def results_of(parameters: int, internal: int, directions: int = 0) -> int:
 
 
 @inlined
-def last_point(values, x):  # type: ignore[no-untyped-def]
+def last_point(values, x):
     """Return the last point of an INTERNAL law, behind its values."""
-    return past(values, BY_RATE * (2 + 2 * x) + 1)
+    return _as_point(past(values, BY_RATE * (2 + 2 * x) + 1))
 
 
 @inlined
-def changes_of(values, x):  # type: ignore[no-untyped-def]
+def changes_of(values, x):
     """Return the derivatives of `switch` of an INTERNAL law."""
     return past(last_point(values, x), POINT + x)
 
 
 @intrinsic
-def start(typing, array):  # type: ignore[no-untyped-def]
+def start(typing, array):
     """Return the pointer to the first element of an array."""
 
-    def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, args):
         return context.make_array(signature.args[0])(context, builder, args[0]).data
 
     return types.CPointer(array.dtype)(array), emit
 
 
 @intrinsic
-def past(typing, pointer, count):  # type: ignore[no-untyped-def]
+def past(typing, pointer, count):
     """Return the pointer to the element number `count`."""
 
-    def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, args):
         return builder.gep(args[0], [args[1]])
 
     return types.CPointer(pointer.dtype)(pointer, WHOLE), emit
 
 
 @intrinsic
-def address(typing, pointer):  # type: ignore[no-untyped-def]
+def address(typing, pointer):
     """Return a pointer as an integer."""
 
-    def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def emit(context, builder, signature, args):
         return builder.ptrtoint(args[0], ir.IntType(64))
 
     return WHOLE(pointer), emit
@@ -263,8 +275,8 @@ def pointing(kind: Any) -> Any:
     """Return a function that turns a pointer, or an address, into a pointer of this type."""
 
     @intrinsic
-    def turn(typing, given):  # type: ignore[no-untyped-def]
-        def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def turn(typing, given):
+        def emit(context, builder, signature, args):
             turned = builder.inttoptr if given == WHOLE else builder.bitcast
             return turned(args[0], context.get_value_type(kind))
 
@@ -273,10 +285,16 @@ def pointing(kind: Any) -> Any:
     return turn
 
 
+def naming(name: str, fields: Sequence[str]) -> Any:
+    """Return a function that gives the numbers at a pointer these names, in this order."""
+    return pointing(Named(name, REAL, {field: k for k, field in enumerate(fields)}))
+
+
+_as_point = naming("Point", _LAST)
 complexes_at, as_spring = pointing(types.CPointer(types.complex128)), pointing(SPRING)
 
 
-def by_address(context, builder, signature, args):  # type: ignore[no-untyped-def]
+def by_address(context, builder, signature, args):
     """Call the function at an address, the first argument, with the others."""
     returned = signature.return_type
     result = ir.VoidType() if returned == types.void else context.get_value_type(returned)
@@ -285,20 +303,31 @@ def by_address(context, builder, signature, args):  # type: ignore[no-untyped-de
     return context.get_dummy_value() if returned == types.void else found
 
 
-def calling(returns: Any, *takes: Any) -> Any:
-    """Return a function that calls one of this signature by its address, the first argument."""
+def emitted(signature: Any, emit: Callable[..., Any]) -> Any:
+    """Return a function of this signature, for compiled functions, whose code `emit` builds."""
 
-    def call(typing, where, *given):  # type: ignore[no-untyped-def]
-        return returns(WHOLE, *takes), by_address
+    def call(typing, *given):
+        return signature, emit
 
-    names = ("typing", "where", *(f"given_{k}" for k in range(len(takes))))
+    names = ("typing", *(f"given_{k}" for k in range(len(signature.args))))
     call.__signature__ = Signature(  # type: ignore[attr-defined]
         [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in names]
     )
     return intrinsic(call)
 
 
-call_begin = calling(REAL, REALS_AT, SPRING)
-call_evaluate = calling(REAL, REALS_AT, SPRING, REALS_AT, REALS_AT, WHOLE, WHOLE, REALS_AT)
-call_switch = calling(REAL, REALS_AT, SPRING, WHOLE, REALS_AT)
-call_number = calling(REAL, REALS_AT, SPRING, REAL)  #: `settle` or `strain`
+def pointed(returns: Any, *takes: Any) -> tuple[Callable[[Callable[..., Any]], Pointed], Any]:
+    """Return a decorator for functions of this signature, and what calls them by their address.
+
+    The address is the first argument of a call.
+    """
+    return partial(Pointed, returns(*takes)), emitted(returns(WHOLE, *takes), by_address)
+
+
+evaluating, call_evaluate = pointed(
+    REAL, REALS_AT, SPRING, REALS_AT, REALS_AT, WHOLE, WHOLE, REALS_AT
+)
+switching, call_switch = pointed(REAL, REALS_AT, SPRING, WHOLE, REALS_AT)
+beginning, call_begin = pointed(REAL, REALS_AT, SPRING)
+settling, call_number = pointed(REAL, REALS_AT, SPRING, REAL)  #: `settle` or `strain`
+inverting = settling

@@ -22,62 +22,19 @@ import math
 
 from numba import njit
 
-from foamfit.springs.compiled.contract import (
-    BY,
-    BY_HELD,
-    BY_STRESS,
-    MISS,
-    OF_HELD,
-    OF_LAW,
-    OF_PARAMETER,
-    OF_STRESS,
-    OPTIONS,
-    SLOPE,
-    Compiled,
-    beginning,
-    evaluating,
-    inner,
-    inverting,
-    past,
-    settling,
-    start,
-    switching,
-)
-from foamfit.springs.compiled.mixture import (
-    AGAIN,
-    BACK,
-    BOTH,
-    CHANGE,
-    FIXED,
-    LEAST_STRAIN,
-    PARAMETERS,
-    ROUNDED,
-    ROW,
-    SNAP,
-    SOFTENING,
-    STIFFENING,
-    WEAKENING,
-    A,
-    as_microscale,
-    as_row,
-    at_stress,
-    density,
-    line,
-    mixture,
-    moves,
-    on_a,
-    shares,
-    stress_in,
-)
+from foamfit.springs.compiled import contract
+from foamfit.springs.compiled import mixture as mix
+from foamfit.springs.compiled.contract import BY, BY_HELD, MISS, OF_LAW, SLOPE, inner, past, start
+from foamfit.springs.compiled.mixture import AGAIN, BACK, BOTH, FIXED, SNAP, A, at_stress, shares
 from foamfit.springs.law import LEAST_RANK, crossing, most_beyond
 
 _crossing, _most_beyond = inner(crossing), inner(most_beyond)
 
 
-@njit(**OPTIONS, cache=True)
-def fill(values, array):  # type: ignore[no-untyped-def]
+@njit(**contract.OPTIONS, cache=True)
+def fill(values, array):
     """Write the row; stiffening, softening and weakening, if present, follow spread_minus."""
-    row = as_row(start(array))
+    row = mix.as_row(start(array))
     count, n, softening, weakening = values.size, 1.0, 0.0, 0.0
     if count == 8 or count == 10:
         n = values[7]
@@ -103,13 +60,8 @@ def fill(values, array):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _end(row, s, high, sigma):  # type: ignore[no-untyped-def]
-    """Set the upper (`high`) or lower end of the branch to a stress, not behind the spring."""
-    soft, bend = s.flexibility, s.curvature
-    eps = at_stress(row, s, sigma)
-    s.flexibility, s.curvature = soft, bend
-    if (eps < s.eps) if high else (eps > s.eps):
-        eps, sigma = s.eps, s.x
+def _put_end(s, high, eps, sigma):
+    """Set the upper (`high`) or lower end of the branch."""
     if high:
         s.high, s.sigma_high = eps, sigma
     else:
@@ -117,20 +69,26 @@ def _end(row, s, high, sigma):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _no_less(row, s, high):  # type: ignore[no-untyped-def]
+def _end(row, s, high, sigma):
+    """Set the upper (`high`) or lower end of the branch to a stress, not behind the spring."""
+    soft, bend = s.flexibility, s.curvature
+    eps = at_stress(row, s, sigma)
+    s.flexibility, s.curvature = soft, bend
+    behind = eps < s.eps if high else eps > s.eps
+    _put_end(s, high, s.eps if behind else eps, s.x if behind else sigma)
+
+
+@inner
+def _no_less(row, s, high):
     """Raise an end of the branch to the least strain at which a micro-spring may snap."""
-    if (s.high if high else s.low) < LEAST_STRAIN:
+    if (s.high if high else s.low) < mix.LEAST_STRAIN:
         soft, bend = s.flexibility, s.curvature
-        sigma = stress_in(row, s, LEAST_STRAIN)
-        if high:
-            s.high, s.sigma_high = LEAST_STRAIN, sigma
-        else:
-            s.low, s.sigma_low = LEAST_STRAIN, sigma
+        _put_end(s, high, mix.LEAST_STRAIN, mix.stress_in(row, s, mix.LEAST_STRAIN))
         s.flexibility, s.curvature = soft, bend
 
 
 @inner
-def _has_loop(row, sigma, up):  # type: ignore[no-untyped-def]
+def _has_loop(row, sigma, up):
     """Whether snap-back lies below snap-through just above (`up`) or just below a stress."""
     log = math.log(sigma)
     if row.minus >= row.plus:
@@ -139,14 +97,14 @@ def _has_loop(row, sigma, up):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _last_stress(row):  # type: ignore[no-untyped-def]
+def _last_stress(row):
     """Return the stress at which the last micro-spring has snapped back."""
     through = row.log_again + row.plus * LEAST_RANK
     return math.exp(min(through, row.log_minus + row.minus * LEAST_RANK))
 
 
 @inner
-def _enter(row, s, branch):  # type: ignore[no-untyped-def]
+def _enter(row, s, branch):
     """Enter a branch at the present strain and stress."""
     s.branch, s.flexibility = branch, 0.0
     s.turns = 1.0 if branch == SNAP or branch == AGAIN else -1.0 if branch == BACK else 0.0
@@ -156,7 +114,7 @@ def _enter(row, s, branch):  # type: ignore[no-untyped-def]
         s.rank, s.snapped, s.rest = -math.inf, 0.0, 1.0
         first = row.log_plus if s.never == 1.0 else row.log_again
         _end(row, s, True, math.exp(first + row.plus * LEAST_RANK))
-        if s.high < LEAST_STRAIN:
+        if s.high < mix.LEAST_STRAIN:
             s.branch = SNAP if s.never == 1.0 else AGAIN
             _no_less(row, s, True)
             s.branch = A
@@ -174,7 +132,7 @@ def _enter(row, s, branch):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _hold(row, s, rank):  # type: ignore[no-untyped-def]
+def _hold(row, s, rank):
     """Hold the present rank.
 
     In a narrow snap the last digit of the stress covers many ranks, so the snapped share is
@@ -182,9 +140,9 @@ def _hold(row, s, rank):  # type: ignore[no-untyped-def]
     """
     p, rest = shares(rank)
     sigma = s.x
-    eps, _, _, on_main, _ = mixture(row, FIXED, p, rest, s.never, sigma)
+    eps, _, _, on_main, _ = mix.mixture(row, FIXED, p, rest, s.never, sigma)
     more = (s.eps - eps) / (row.star + sigma / (row.kc + sigma) - on_main)
-    if abs(more) < min(ROUNDED, p, rest):
+    if abs(more) < min(mix.ROUNDED, p, rest):
         p, rest = p + more, rest - more
     s.branch, s.turns, s.rank, s.snapped, s.rest = FIXED, 0.0, rank, p, rest
     s.flexibility = 0.0
@@ -195,28 +153,28 @@ def _hold(row, s, rank):  # type: ignore[no-untyped-def]
 
 
 @inner
-def rank_now(row, s):  # type: ignore[no-untyped-def]
+def rank_now(row, s):
     """Return the rank up to which micro-springs have snapped."""
     branch = int(s.branch)
-    if not moves(branch):
+    if not mix.moves(branch):
         return s.rank
-    place, scale = line(row, branch)
+    place, scale = mix.line(row, branch)
     return (math.log(s.x) - place) / scale
 
 
 @inner
-def _turn(row, s, up, out):  # type: ignore[no-untyped-def]
+def _turn(row, s, up, out):
     """Hold the rank that a spring has reached where its strain turns."""
     branch, remembers, rank = s.branch, row.remembers > 0.0, rank_now(row, s)
     first = 5 if branch == BACK else 3
-    _, scale = line(row, int(branch))
+    _, scale = mix.line(row, int(branch))
     for h in range(2 if branch == SNAP and remembers else 1):
-        by = past(out, h * CHANGE)
-        by[OF_HELD + h], by[OF_STRESS] = 0.0, 1.0 / (scale * s.x)
-        by[OF_PARAMETER + first] = -math.exp(-row[first]) / scale
-        by[OF_PARAMETER + first + 1] = -rank / scale
+        by = past(out, h * mix.CHANGE)
+        by[contract.OF_HELD + h], by[contract.OF_STRESS] = 0.0, 1.0 / (scale * s.x)
+        by[contract.OF_PARAMETER + first] = -math.exp(-row[first]) / scale
+        by[contract.OF_PARAMETER + first + 1] = -rank / scale
         if branch == AGAIN:
-            by[OF_PARAMETER + WEAKENING] = 1.0 / scale
+            by[contract.OF_PARAMETER + mix.WEAKENING] = 1.0 / scale
     if branch == SNAP and remembers:
         s.ever = rank
         _, s.never = shares(rank)
@@ -225,13 +183,13 @@ def _turn(row, s, up, out):  # type: ignore[no-untyped-def]
         _enter(row, s, BOTH)
 
 
-@switching
-def switch(row, s, up, out):  # type: ignore[no-untyped-def]
-    row, s = as_row(row), as_microscale(s)
+@contract.switching
+def switch(row, s, up, out):
+    row, s = mix.as_row(row), mix.as_microscale(s)
     branch, remembers = s.branch, row.remembers > 0.0
-    for c in range(2 * CHANGE):
+    for c in range(2 * mix.CHANGE):
         out[c] = 0.0
-    out[OF_HELD], out[CHANGE + OF_HELD + 1] = 1.0, 1.0
+    out[contract.OF_HELD], out[mix.CHANGE + contract.OF_HELD + 1] = 1.0, 1.0
     if (branch == BACK) if up else (branch == SNAP or branch == AGAIN):
         _turn(row, s, up, out)
         return 0.0
@@ -257,44 +215,44 @@ def switch(row, s, up, out):  # type: ignore[no-untyped-def]
             if row.log_again == row.log_plus:
                 _enter(row, s, SNAP)
             else:
-                out[OF_HELD], out[OF_HELD + 1] = 0.0, 1.0
+                out[contract.OF_HELD], out[contract.OF_HELD + 1] = 0.0, 1.0
                 _hold(row, s, s.ever)
-    elif sigma <= _last_stress(row) or s.eps <= LEAST_STRAIN:
-        out[OF_HELD] = 0.0
+    elif sigma <= _last_stress(row) or s.eps <= mix.LEAST_STRAIN:
+        out[contract.OF_HELD] = 0.0
         _enter(row, s, A)
     else:
         _enter(row, s, BOTH if branch == BACK else BACK)
     return 0.0
 
 
-@beginning
-def begin(row, s):  # type: ignore[no-untyped-def]
-    row, s = as_row(row), as_microscale(s)
+@contract.beginning
+def begin(row, s):
+    row, s = mix.as_row(row), mix.as_microscale(s)
     s.eps = s.x = s.snapped = 0.0
     s.rank, s.ever, s.rest, s.never = -math.inf, -math.inf, 1.0, 1.0
     _enter(row, s, A)
     return 0.0
 
 
-@settling
-def settle(row, s, eps):  # type: ignore[no-untyped-def]
-    row, s = as_row(row), as_microscale(s)
-    sigma = stress_in(row, s, eps)
+@contract.settling
+def settle(row, s, eps):
+    row, s = mix.as_row(row), mix.as_microscale(s)
+    sigma = mix.stress_in(row, s, eps)
     s.eps, s.x = eps, sigma
     return sigma
 
 
-@inverting
-def strain(row, s, sigma):  # type: ignore[no-untyped-def]
-    row, s = as_row(row), as_microscale(s)
+@contract.inverting
+def strain(row, s, sigma):
+    row, s = mix.as_row(row), mix.as_microscale(s)
     eps = at_stress(row, s, sigma)
     s.soft = s.flexibility
     return eps
 
 
-@evaluating
-def evaluate(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
-    row, s = as_row(row), as_microscale(s)
+@contract.evaluating
+def evaluate(row, s, eps, x, count, want, out):
+    row, s = mix.as_row(row), mix.as_microscale(s)
     branch = s.branch
     k0, kc, star, n, remembers = row.k0, row.kc, row.star, row.n, row.remembers > 0.0
     p, rest, never, rank, pace, weight = s.snapped, s.rest, s.never, 0.0, 0.0, 0.0
@@ -306,15 +264,15 @@ def evaluate(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
     mixed = remembers and branch != SNAP and never < 1.0
     softened = mixed and row.worn != k0
     if want and mixed:
-        on_ever = density(s.ever)
+        on_ever = mix.density(s.ever)
     if want and not moving and p > 0.0:
-        weight = density(s.rank)
+        weight = mix.density(s.rank)
     for j in range(count):
         sigma = x[j]
         if moving and sigma > 0.0:
             rank = (math.log(sigma) - place) * wide
             p, rest = shares(rank)
-            weight, pace = density(rank), wide / sigma
+            weight, pace = mix.density(rank), wide / sigma
         elif moving:  # continued
             rank = p = weight = pace = 0.0
             rest = 1.0
@@ -323,10 +281,10 @@ def evaluate(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
         if mixed:
             fresh = min(never, rest)
             worn = rest - fresh
-        main, soft, _, by_n = on_a(n, k0, sigma)
+        main, soft, _, by_n = mix.on_a(n, k0, sigma)
         one, soft_one, by_n_one = main, soft, by_n
         if softened:
-            one, soft_one, _, by_n_one = on_a(n, row.worn, sigma)
+            one, soft_one, _, by_n_one = mix.on_a(n, row.worn, sigma)
         softness = fresh * soft + worn * soft_one
         on_c = star + sigma * two
         by_rank = weight * (on_c - one)
@@ -338,30 +296,25 @@ def evaluate(row, s, eps, x, count, want, out):  # type: ignore[no-untyped-def]
         by, held = past(out, BY * count + j), past(out, BY_HELD * count + j)
         by[0] = slope * sigma * softness / k0
         by[count], by[2 * count] = slope * p * sigma * two * two, -slope * p
-        for c in range(3, PARAMETERS):
+        for c in range(3, mix.PARAMETERS):
             by[c * count] = 0.0
         held[0], held[count] = 0.0, 0.0
         if moving:
             through = slope * by_rank * wide
             by[first * count], by[(first + 1) * count] = through * by_median, through * rank
             if branch >= BOTH:
-                by[WEAKENING * count] = -through
+                by[mix.WEAKENING * count] = -through
         else:
             held[0] = -slope * by_rank
         if remembers:
-            by[STIFFENING * count] = -slope * (fresh * by_n + worn * by_n_one)
-            by[SOFTENING * count] = -slope * worn * sigma * soft_one
+            by[mix.STIFFENING * count] = -slope * (fresh * by_n + worn * by_n_one)
+            by[mix.SOFTENING * count] = -slope * worn * sigma * soft_one
             held[count] = -slope * on_ever * (one - main)
     return 0.0
 
 
-COMPILED = Compiled(
-    fill,
-    BY_STRESS,
-    len(ROW),
-    PARAMETERS,
-    1,
-    (begin.address, evaluate.address, switch.address, settle.address, strain.address),
-    (ROW.index("k0"), ROW.index("kc")),
-    ROW.index("star"),
+_FUNCTIONS = (begin, evaluate, switch, settle, strain)
+_K0, _KC, _STAR = (mix.ROW.index(name) for name in ("k0", "kc", "star"))
+COMPILED = contract.Compiled(
+    fill, contract.BY_STRESS, len(mix.ROW), mix.PARAMETERS, 1, _FUNCTIONS, (_K0, _KC), _STAR
 )

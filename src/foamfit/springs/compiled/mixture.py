@@ -7,16 +7,8 @@ from __future__ import annotations
 
 import math
 
-from foamfit.springs.compiled.contract import (
-    HELD,
-    OF_PARAMETER,
-    REAL,
-    SPRING,
-    Named,
-    inlined,
-    inner,
-    pointing,
-)
+from foamfit.springs.compiled import contract
+from foamfit.springs.compiled.contract import inlined, inner
 
 # Branches: A before the first snap, FIXED for a constant snapped fraction, and those above.
 A, FIXED, SNAP, BACK, BOTH, AGAIN = 0, 6, 7, 8, 9, 10
@@ -27,14 +19,16 @@ ROW = (
     "k0", "kc", "star", "log_plus", "plus", "log_minus", "minus", "n", "worn", "log_again",
     "remembers", "cross",
 )  # fmt: skip
-as_row = pointing(Named("Microscale row", REAL, {name: k for k, name in enumerate(ROW)}))
+as_row = contract.naming("Microscale row", ROW)
 # Parameters by their place among the derivatives.
 STIFFENING, SOFTENING, WEAKENING, PARAMETERS = range(7, 11)
 # Memory: ranks w and W; p, 1 - p, 1 - P; dε/dσ and d²ε/dσ² where the stress was last computed.
 _MEMORY = ("rank", "ever", "snapped", "rest", "never", "flexibility", "curvature")
-_PLACES = {name: HELD + k for k, name in enumerate(_MEMORY)}
-as_microscale = pointing(Named("Microscale spring", REAL, SPRING.places | _PLACES))
-CHANGE = OF_PARAMETER + PARAMETERS
+_PLACES = {name: contract.HELD + k for k, name in enumerate(_MEMORY)}
+as_microscale = contract.pointing(
+    contract.Named("Microscale spring", contract.REAL, contract.SPRING.places | _PLACES)
+)
+CHANGE = contract.OF_PARAMETER + PARAMETERS
 # Strain below which no micro-spring snaps: ln σ is singular at zero.
 LEAST_STRAIN = 1e-14
 # Relative step of Halley's method, per width of the snap, below which the step is the last: the
@@ -46,20 +40,20 @@ _HALF, _TURN = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
 
 
 @inlined
-def shares(rank):  # type: ignore[no-untyped-def]
+def shares(rank):
     """Return Φ and 1 - Φ, the shares below and above a rank; the smaller one has all digits."""
     least = 0.5 * math.erfc(_HALF * abs(rank))
     return (1.0 - least, least) if rank > 0.0 else (least, 1.0 - least)
 
 
 @inlined
-def density(rank):  # type: ignore[no-untyped-def]
+def density(rank):
     """Return Φ', the density of ranks."""
     return _TURN * math.exp(-0.5 * rank * rank)
 
 
 @inlined
-def on_a(n, k, sigma):  # type: ignore[no-untyped-def]
+def on_a(n, k, sigma):
     """Return strain a(σ; k) (-inf past its pole) and its derivatives by σ, σ twice, and n."""
     if n == 1.0:
         one = 1.0 / (k + sigma)
@@ -78,7 +72,7 @@ def on_a(n, k, sigma):  # type: ignore[no-untyped-def]
 
 
 @inner
-def stress_on_a(n, k, eps):  # type: ignore[no-untyped-def]
+def stress_on_a(n, k, eps):
     """Return the stress at a strain of branch a; infinite from its end on."""
     if not eps < 1.0:
         return math.inf
@@ -86,13 +80,13 @@ def stress_on_a(n, k, eps):  # type: ignore[no-untyped-def]
 
 
 @inner
-def moves(branch):  # type: ignore[no-untyped-def]
+def moves(branch):
     """Whether micro-springs snap or snap back on a branch."""
     return branch > FIXED
 
 
 @inner
-def line(row, branch):  # type: ignore[no-untyped-def]
+def line(row, branch):
     """Return mean and standard deviation of the normal distribution of ln σ on a branch."""
     if branch == BACK:
         return row.log_minus, row.minus
@@ -100,7 +94,7 @@ def line(row, branch):  # type: ignore[no-untyped-def]
 
 
 @inner
-def mixture(row, branch, p, rest, never, sigma):  # type: ignore[no-untyped-def]
+def mixture(row, branch, p, rest, never, sigma):
     """Return the strain at a stress, given p, 1 - p and 1 - P, and two derivatives at fixed p, P.
 
     The last two values are strain and slope of the branch a that snaps.
@@ -122,7 +116,7 @@ def mixture(row, branch, p, rest, never, sigma):  # type: ignore[no-untyped-def]
 
 
 @inner
-def at_stress(row, s, sigma):  # type: ignore[no-untyped-def]
+def at_stress(row, s, sigma):
     """Return the strain at a stress on the branch; fill dε/dσ and d²ε/dσ²."""
     branch = int(s.branch)
     if not moves(branch) or not sigma > 0.0:  # where none has snapped, branches are continued
@@ -143,7 +137,7 @@ def at_stress(row, s, sigma):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _ends_of_stress(row, s, eps):  # type: ignore[no-untyped-def]
+def _ends_of_stress(row, s, eps):
     """Return bounds of the stress at a strain, from the stiffest and the softest branch."""
     n, stiff = row.n, stress_on_a(row.n, row.k0, eps)
     if eps < 0.0 or (not moves(int(s.branch)) and s.snapped == 0.0):
@@ -158,7 +152,7 @@ def _ends_of_stress(row, s, eps):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _halfway(low, high, sigma):  # type: ignore[no-untyped-def]
+def _halfway(low, high, sigma):
     """Return a stress between two bounds, halfway in the logarithm if possible."""
     if high == math.inf:
         return 2.0 * max(sigma, LEAST)
@@ -170,7 +164,7 @@ def _halfway(low, high, sigma):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _held_stress(row, p, rest, eps):  # type: ignore[no-untyped-def]
+def _held_stress(row, p, rest, eps):
     """Return the stress at a strain for fixed p without memory: the root of a quadratic."""
     k0, kc, beyond = row.k0, row.kc, eps - p * row.star
     a, product = 1.0 - beyond, beyond * k0 * kc
@@ -182,7 +176,7 @@ def _held_stress(row, p, rest, eps):  # type: ignore[no-untyped-def]
 
 
 @inner
-def stress_in(row, s, eps):  # type: ignore[no-untyped-def]
+def stress_in(row, s, eps):
     """Return the stress at a strain on the branch; infinite past its end.
 
     The method is Halley's inside a bracket, from a parabola at the previous point.

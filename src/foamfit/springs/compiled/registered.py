@@ -1,4 +1,10 @@
-"""A registered law, compiled to the contract of the solvers by the functions of `compiled.own`."""
+"""A registered law, compiled to the contract of the solvers.
+
+The functions of such a law are plain formulas, compiled for complex numbers. Every derivative is
+the imaginary part of a formula with an imaginary step in one of its arguments, exact to rounding
+(Squire & Trapp 1998). Only one function is compiled for each law; those of the contract are
+compiled once for all, and call it by the address that its spring keeps in memory.
+"""
 
 from __future__ import annotations
 
@@ -10,69 +16,323 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from llvmlite import ir
 from numba import carray, cfunc, njit, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from foamfit.arrays import Array
-from foamfit.springs.compiled.contract import (
-    EXPLICIT,
-    FADES,
-    FLOWS,
-    INTERNAL,
-    OPTIONS,
-    REAL,
-    REALS_AT,
-    RESULTS,
-    SPRING,
-    STILL,
-    TINY,
-    Compiled,
-    call_begin,
-    past,
-    results_of,
-)  # fmt: skip
-from foamfit.springs.compiled.own import (
-    BEGIN,
-    BOUNDED,
-    COMPLEXES,
-    COUNT,
-    DAMPS,
-    ENDS,
-    FORMULA,
-    FORMULAS,
-    INSIDE,
-    KIND,
-    OTHERS,
-    UP,
-    VALUES,
-    slope_at_rest,
-)  # fmt: skip
+from foamfit.springs.compiled import contract
+from foamfit.springs.compiled.bistable import settle
+from foamfit.springs.compiled.contract import BY, EXPLICIT, INTERNAL, SLOPE, inner, past
 
 if TYPE_CHECKING:
     from foamfit.springs.laws.record import Functions, Law
 
+STEP = 1e-40  # imaginary step
+# What the function of a law fills: σ, V, A and B; the ends of the branch; or the internal variables
+# on the next branch, whose number it returns.
+VALUES, ENDS, DOWN, UP = range(4)
+# What a spring of a registered law keeps in memory: the address of its function, kind, numbers of
+# parameters and of internal variables, whether its branches end, and whether V depends on the rate.
+FORMULAS, KIND, COUNT, INSIDE, BOUNDED, DAMPS = range(contract.OWN, contract.OWN + 6)
+COMPLEXES = types.CPointer(types.complex128)
+FORMULA = contract.WHOLE(COMPLEXES, contract.WHOLE, contract.WHOLE, COMPLEXES)
+FURTHEST, TRIALS = 1e12, 200  # largest strain, and trials, in the search for a strain
+
+
+def _call(context, builder, signature, args):
+    """Call the function of a law, at the address `args[0]`, by numba's own convention.
+
+    An exception, such as that of a division by zero, is not raised: the results keep what they were
+    before.
+    """
+    long, told = ir.IntType(64), ir.IntType(8).as_pointer()
+    result = cgutils.alloca_once_value(builder, ir.Constant(long, 0))
+    given = [result, cgutils.alloca_once(builder, told), *args[1:]]
+    kind = ir.FunctionType(ir.IntType(32), [value.type for value in given])
+    builder.call(builder.inttoptr(args[0], kind.as_pointer()), given)
+    return builder.load(result)
+
+
+call_formulas = contract.emitted(contract.WHOLE(contract.WHOLE, *FORMULA.args), _call)
+
+
+@inner
+def ask(s, point, what, out):
+    """Call the function of the law of a spring, on its branch."""
+    return call_formulas(int(s[FORMULAS]), point, int(s.branch), what, out)
+
+
+@inner
+def gather(row, s, eps, x):
+    """Gather the arguments of the formulas at a point; return them, and room for results.
+
+    They are strain, rate, x and p, at the end of the row.
+    """
+    inside, count = int(s[INSIDE]), int(s[COUNT])
+    point = contract.complexes_at(contract.address(past(row, count + 1)))
+    point[0], point[1] = complex(eps, 0.0), complex(s.rate, 0.0)
+    for k in range(inside):
+        point[2 + k] = complex(x[k], 0.0)
+    for k in range(count):
+        point[2 + inside + k] = complex(row[k], 0.0)
+    return point, past(point, 2 + inside + count)
+
+
+@inner
+def stress_of(row, s, point, found):
+    """Return stress and slope at the arguments `point`, whose strain has the imaginary step."""
+    ask(s, point, VALUES, found)
+    return found[0].real, found[0].imag / STEP
+
+
+@inner
+def bound(row, s, point, found):
+    """Set the ends of the branch."""
+    found[0], found[1], found[2] = complex(-math.inf, 0.0), complex(math.inf, 0.0), 0j
+    ask(s, point, ENDS, found)
+    s.low, s.high, s.turns = found[0].real, found[1].real, found[2].real
+
+
+@inner
+def bound_stress(row, s, point, found):
+    """Set the stresses at the ends of the branch of an EXPLICIT law."""
+    low, high, flat, size = -math.inf, math.inf, True, 0.0
+    if s.low > -math.inf:
+        point[0] = complex(s.low, STEP)
+        low, slope = stress_of(row, s, point, found)
+        flat, size = flat and slope == 0.0, abs(low)
+    if s.high < math.inf:
+        point[0] = complex(s.high, STEP)
+        high, slope = stress_of(row, s, point, found)
+        flat, size = flat and slope == 0.0, max(size, abs(high))
+    if flat and abs(high - low) <= 1e-14 * size:  # without rounding
+        high = low
+    s.sigma_low, s.sigma_high = low, high
+
+
+@inner
+def enter(row, s):
+    """Set the ends of a branch at its beginning."""
+    point, found = gather(row, s, s.eps, s.xs)
+    bound(row, s, point, found)
+    s.sigma_low, s.sigma_high = -math.inf, math.inf
+    if s[KIND] == EXPLICIT:
+        bound_stress(row, s, point, found)
+
+
+@contract.beginning
+def _begin(row, s):
+    s.eps = s.branch = s.rate = 0.0
+    s.lossy = s[DAMPS]
+    for k in range(int(s[INSIDE])):
+        s.xs[k] = 0.0
+    enter(row, s)
+    return 0.0
+
+
+@inner
+def evaluate_explicit(row, s, eps, n, want, out):
+    """Fill the results of an EXPLICIT law."""
+    count = int(s[COUNT])
+    point, found = gather(row, s, 0.0, s)
+    for j in range(n):
+        point[0] = complex(eps[j], STEP)
+        ask(s, point, VALUES, found)
+        out[contract.OF_LAW * n + j], out[SLOPE * n + j] = found[0].real, found[0].imag / STEP
+        for c in range(contract.MISS, BY):
+            out[c * n + j] = 0.0
+        if want == 0:
+            continue
+        point[0] = complex(eps[j], 0.0)
+        for c in range(count):
+            point[2 + c] = complex(row[c], STEP)
+            ask(s, point, VALUES, found)
+            point[2 + c] = complex(row[c], 0.0)
+            out[(BY + c) * n + j] = found[0].imag / STEP
+
+
+@inner
+def is_last(s, eps, x, want, point):
+    """Whether an INTERNAL law was evaluated here last; else note that it is."""
+    same = want < point.wanted and eps == point.eps and s.branch == point.branch
+    same = same and (s[DAMPS] == 0.0 or s.rate == point.rate)
+    for k in range(int(s[INSIDE])):
+        same = same and x[k] == point[contract.POINT + k]
+        point[contract.POINT + k] = x[k]
+    if not same:
+        point.wanted, point.derived, point.eps = want + 1.0, 0.0, eps
+        point.rate, point.branch = s.rate, s.branch
+    return same
+
+
+@inner
+def derive_along(s, point, found, dx, own, out):
+    """Fill derivatives of σ, V, A and B by dx and, unless negative, parameter `own`."""
+    inside, total = int(s[INSIDE]), 1.0 if own >= 0 else 0.0
+    for k in range(inside):
+        total += abs(dx[k])
+    if not 0.0 < total < math.inf:
+        for f in range(2 + 2 * inside):
+            out[f] = 0.0 * total
+        return
+    step = STEP / total
+    for k in range(inside):
+        point[2 + k] = complex(point[2 + k].real, step * dx[k])
+    if own >= 0:
+        point[2 + inside + own] = complex(point[2 + inside + own].real, step)
+    ask(s, point, VALUES, found)
+    for f in range(2 + 2 * inside):
+        out[f] = found[f].imag / step
+
+
+@inner
+def evaluate_internal(row, s, eps, x, own, want, out):
+    """Fill the results of an INTERNAL law."""
+    inside, values = int(s[INSIDE]), past(out, BY)
+    size, last = 2 + 2 * inside, contract.last_point(values, inside)
+    if want == contract.DIRECTION:
+        point, found = gather(row, s, s.eps, s.xs)
+        derive_along(s, point, found, x, own, out)
+        return
+    if is_last(s, eps, x, want, last):
+        return
+    point, found = gather(row, s, eps, x)
+    point[0] = complex(eps, STEP)
+    ask(s, point, VALUES, found)
+    for f in range(size):
+        values[f], values[size + f] = found[f].real, found[f].imag / STEP
+    out[contract.OF_LAW], out[SLOPE] = values[0], values[size]
+    point[0] = complex(eps, 0.0)
+    if want and s[DAMPS] > 0.0:
+        point[1] = complex(s.rate, STEP)
+        ask(s, point, VALUES, found)
+        values[contract.BY_RATE * size] = found[1].imag / STEP
+        point[1] = complex(s.rate, 0.0)
+    for k in range(2 if want == contract.PATHS else 0):  # along A and along B
+        along, to = past(values, 2 + k * inside), past(values, (contract.ALONG_A + k) * size)
+        derive_along(s, point, found, along, -1, to)
+    if s[BOUNDED] > 0.0:  # the ends may depend on the internal variables
+        point, found = gather(row, s, eps, x)
+        bound(row, s, point, found)
+
+
+@contract.evaluating
+def _evaluate(row, s, eps, x, n, want, out):
+    if s[KIND] == EXPLICIT:
+        evaluate_explicit(row, s, eps, n, want, out)
+    else:
+        evaluate_internal(row, s, eps[0], x, n, want, out)
+    return 0.0
+
+
+@inner
+def derive_switch(row, s, turns, up, out):
+    """Fill the derivatives of internal variables on the next branch, and of the end, by ε, x, p."""
+    count, inside = int(s[COUNT]), int(s[INSIDE])
+    wide = 1 + inside + count
+    for q in range(wide):
+        point, found = gather(row, s, s.eps, s.xs)
+        at = q if q == 0 else q + 1
+        kept = point[at].real
+        point[at] = complex(kept, STEP)
+        found[0] = found[1] = found[2] = 0j
+        ask(s, point, ENDS, found)
+        end = found[1 if up else 0].imag / STEP
+        out[inside * wide + q] = end if not turns else 1.0 if q == 0 else 0.0
+        ask(s, point, UP if up else DOWN, found)
+        for k in range(inside):
+            out[k * wide + q] = point[2 + k].imag / STEP
+
+
+@contract.switching
+def _switch(row, s, up, out):
+    turns = s.turns * (1.0 if up else -1.0) < 0.0
+    if not turns:
+        s.eps = s.high if up else s.low
+    if s[KIND] == INTERNAL:
+        derive_switch(row, s, turns, up, out)
+    point, found = gather(row, s, s.eps, s.xs)
+    s.branch = ask(s, point, UP if up else DOWN, found)
+    for k in range(int(s[INSIDE])):
+        s.xs[k] = point[2 + k].real
+    enter(row, s)
+    return 0.0
+
+
+@contract.inverting
+def _strain(row, s, sigma):
+    """Search by Newton's method inside a bracket."""
+    point, found = gather(row, s, 0.0, s.xs)
+    if s.sigma_low == s.sigma_high:
+        s.soft = math.inf
+        return s.low
+    eps, low, high = min(max(s.eps, s.low), s.high), -math.inf, math.inf
+    for trial in range(TRIALS):
+        point[0] = complex(eps, STEP)
+        value, slope = stress_of(row, s, point, found)
+        miss = value - sigma
+        if abs(eps) > FURTHEST:
+            s.soft = 0.0
+            return math.inf if eps > 0.0 else -math.inf
+        if not abs(miss) < math.inf:  # beyond the strains that the law admits
+            miss = math.inf if eps > 0.0 else -math.inf
+        s.soft = 1.0 / slope if slope > 0.0 else math.inf
+        if miss > 0.0:
+            high = eps
+        elif miss < 0.0:
+            low = eps
+        else:
+            break
+        new = eps - miss * s.soft
+        if abs(new - eps) <= 2e-16 * abs(eps):
+            break
+        if not low < new < high or trial % 8 == 7:
+            if low > -math.inf and high < math.inf:
+                new = 0.5 * (low + high)
+            elif not low < new < high:
+                new = eps + (1.0 if miss < 0.0 else -1.0) * max(abs(eps), 1e-3)
+            if new in (low, high):  # neighbouring floating-point numbers
+                break
+        eps = new
+    return eps
+
+
+@contract.outer
+def slope_at_rest(where, row, s):
+    """Return dσ/dε at rest along the path of the internal variables."""
+    block, own = contract.as_spring(contract.start(s)), contract.start(row)
+    contract.call_begin(where[0], own, block)
+    inside, out = int(block[INSIDE]), block.results
+    law, want = where[contract.EVALUATE], contract.PATHS
+    contract.call_evaluate(law, own, block, block.point, block.xs, 1, want, out)
+    slope = out[SLOPE]
+    if block[KIND] == INTERNAL:
+        slope += out[BY + contract.ALONG_A * (2 + 2 * inside)]
+    return slope
+
+
+# ---------------------------------------------------------------- compilation
+
 _ALONE: dict[str, Any] = {
-    **OPTIONS,
-    "no_rewrites": False,
-    "no_cpython_wrapper": True,
-    "no_cfunc_wrapper": True,
-}
+    **contract.OPTIONS, "no_rewrites": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True,
+}  # fmt: skip
 _WITHIN: dict[str, Any] = {**_ALONE, "_nrt": False}
 kept: list[Any] = []  # compiled functions, whose addresses stay valid
 
 
 @njit(**_WITHIN)
-def _nothing(p, x, strain, branch, out):  # type: ignore[no-untyped-def]
+def _nothing(p, x, strain, branch, out):
     """Leave rates at zero, and the branch without ends."""
 
 
 @njit(**_WITHIN)
-def _same(p, x, strain, branch, up):  # type: ignore[no-untyped-def]
+def _same(p, x, strain, branch, up):
     """Stay on the branch."""
     return branch
 
 
 @njit(**_WITHIN)
-def _no_stress(p, x, strain, rate, branch):  # type: ignore[no-untyped-def]
+def _no_stress(p, x, strain, rate, branch):
     return 0j
 
 
@@ -89,8 +349,8 @@ def _tuple_at(count: int) -> Any:
     kind = types.UniTuple(types.complex128, count)
 
     @intrinsic
-    def load(typing, pointer):  # type: ignore[no-untyped-def]
-        def emit(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def load(typing, pointer):
+        def emit(context, builder, signature, args):
             at = [builder.gep(args[0], [ir.Constant(ir.IntType(64), k)]) for k in range(count)]
             return context.make_tuple(builder, kind, [builder.load(one) for one in at])
 
@@ -107,7 +367,7 @@ def _formulas(given: Functions, count: int, inside: int) -> Any:
     load = _tuple_at(count)
 
     @njit(FORMULA, **_ALONE)
-    def formulas(point, branch, what, out):  # type: ignore[no-untyped-def]
+    def formulas(point, branch, what, out):
         p, x = load(past(point, 2 + inside)), carray(past(point, 2), (inside,))
         strain = point[0]
         if what == VALUES:
@@ -127,7 +387,7 @@ def _formulas(given: Functions, count: int, inside: int) -> Any:
     return formulas
 
 
-def compile_law(law: Law) -> Compiled:
+def compile_law(law: Law) -> contract.Compiled:
     """Compile a registered law."""
     given: Any = law.functions
     count, inside = len(law.params), law.internal
@@ -138,25 +398,27 @@ def compile_law(law: Law) -> Compiled:
     made = formulas.overloads[FORMULA.args]
     where = float(made.library.get_pointer_to_function(made.fndesc.llvm_func_name))  # below 2^53
 
-    begin_any = BEGIN
+    begin_any = _begin.address
 
-    @cfunc(REAL(REALS_AT, SPRING), **OPTIONS)
-    def begin(row, s):  # type: ignore[no-untyped-def]
+    @cfunc(contract.REAL(contract.REALS_AT, contract.SPRING), **contract.OPTIONS)
+    def begin(row, s):
         s[FORMULAS], s[KIND], s[COUNT], s[INSIDE] = where, kind, count, inside
         s[BOUNDED], s[DAMPS] = bounded, damps
-        call_begin(begin_any, row, s)
+        contract.call_begin(begin_any, row, s)
         return 0.0
 
-    addresses: Any = begin.address, *OTHERS
+    functions = (begin, _evaluate, _switch, settle, _strain)
+    addresses = tuple(one.address for one in functions)
     kept.append((formulas, begin))  # the addresses stay valid
     # parameters, slope at rest, then room for complex numbers
     columns = count + 1 + 2 * (2 + inside + count + max(3, 2 + 2 * inside))
-    fill = _fill(given.admissible, count, addresses, RESULTS + results_of(count, inside))
-    flows = FLOWS if given.along or given.viscous else FADES if given.decay else STILL
-    if flows == FADES and (given.ends or given.switch):
-        flows = FLOWS
-    return Compiled(
-        fill, kind, columns, count, inside, addresses, (count,), -1, damps * TINY, flows
+    size = contract.RESULTS + contract.results_of(count, inside)
+    fill = _fill(given.admissible, count, addresses, size)
+    flows = contract.FADES if given.decay else contract.STILL
+    if given.along or given.viscous or (given.decay and (given.ends or given.switch)):
+        flows = contract.FLOWS
+    return contract.Compiled(
+        fill, kind, columns, count, inside, functions, (count,), -1, damps * contract.TINY, flows
     )
 
 

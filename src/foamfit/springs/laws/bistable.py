@@ -1,10 +1,10 @@
-"""The hysteretic bistable spring of the paper (eqs. 1-5)."""
+"""The springs of the paper: the hysteretic bistable one (eqs. 1-5) and the linear one."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,16 @@ from foamfit.springs.laws.record import LAST_STRAIN, Between, Compared, Law, Par
 from foamfit.springs.laws.shared import COMPARED_ETA, COMPARED_HEIGHT, COMPARED_K0, K0, KC, steeper
 from foamfit.springs.loop import Loop
 from foamfit.springs.spring import Relaxation, Spring, freeze_numbers, freeze_terms, require
+
+
+def _point(place: int, what: str) -> Any:
+    """Return a property that is one of the `derived_points`, None if infinite."""
+
+    def point(spring: BistableSpring) -> float | None:
+        value = derived_points(*spring.seven)[place]
+        return value if math.isfinite(value) else None
+
+    return property(point, doc=what)
 
 
 @dataclass(frozen=True)
@@ -75,36 +85,15 @@ class BistableSpring(Spring):
         return LAW
 
     @property
-    def seven(self) -> tuple[float, float, float, float, float, float, float]:
+    def seven(self) -> tuple[float, ...]:
         """The seven parameters of the law, SI."""
-        first = (self.k0, self.kc, self.dsigma, self.eps_a)
-        return *first, self.eps_c, self.kh_plus, self.kh_minus
+        return self.values[:-1]
 
-    @property
-    def sigma_a(self) -> float:
-        """σ_a, stress at A1, Pa."""
-        return derived_points(*self.seven)[0]
-
-    @property
-    def sigma_c(self) -> float:
-        """σ̄_c, stress at C2, Pa."""
-        return derived_points(*self.seven)[1]
-
-    @property
-    def eps_star(self) -> float:
-        """ε_*, strain of branch c at zero stress (eq. 2)."""
-        return derived_points(*self.seven)[2]
-
-    @property
-    def eps_hat_a(self) -> float | None:
-        """ε̂_a, strain at A2 (eq. 4); None if branch e never meets branch a."""
-        eps_hat_a = derived_points(*self.seven)[3]
-        return eps_hat_a if math.isfinite(eps_hat_a) else None
-
-    @property
-    def eps_hat_c(self) -> float:
-        """ε̂_c, strain at C1 (eq. 5)."""
-        return derived_points(*self.seven)[4]
+    sigma_a = _point(0, "σ_a, stress at A1, Pa.")
+    sigma_c = _point(1, "σ̄_c, stress at C2, Pa.")
+    eps_star = _point(2, "ε_*, strain of branch c at zero stress (eq. 2).")
+    eps_hat_a = _point(3, "ε̂_a, strain at A2 (eq. 4); None if branch e never meets branch a.")
+    eps_hat_c = _point(4, "ε̂_c, strain at C1 (eq. 5).")
 
     @property
     def sigma_hat_a(self) -> float | None:
@@ -115,7 +104,7 @@ class BistableSpring(Spring):
     @property
     def sigma_hat_c(self) -> float:
         """Stress at C1, Pa."""
-        return self.sigma_a + self.kh_plus * (self.eps_hat_c - self.eps_a)
+        return float(self.sigma_a + self.kh_plus * (self.eps_hat_c - self.eps_a))
 
     @property
     def corners(self) -> dict[str, tuple[float, float]]:
@@ -329,4 +318,70 @@ LAW = Law(
     inner_loops=False,
     remembers=False,
     published=True,
+)  # fmt: skip
+
+
+# ---------------------------------------------------------------- linear springs
+
+
+@dataclass(frozen=True)
+class LinearSpring(Spring):
+    """The linear spring S1 of the two-spring models, σ = k0 ε, with a dashpot in parallel.
+
+    Parameters
+    ----------
+    k0 : float
+        Slope, Pa.
+    eta : float
+        η, dashpot in parallel, Pa·s.
+    unilateral : bool
+        Whether the spring carries no tension.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not admissible; the message names it.
+    """
+
+    k0: float
+    eta: float = 0.0
+    unilateral: bool = False
+
+    def __post_init__(self) -> None:
+        """Raise InputError for an inadmissible value; the message names it."""
+        freeze_numbers(self, LINEAR_LAW)
+
+    @property
+    def law(self) -> Law:
+        """The record of its law."""
+        return UNILATERAL_LAW if self.unilateral else LINEAR_LAW
+
+    @property
+    def relaxation(self) -> Relaxation:
+        """Relaxation terms; a linear spring has none."""
+        return ()
+
+
+def _unilateral(k0: float, eta: float = 0.0) -> LinearSpring:
+    return LinearSpring(k0, eta, unilateral=True)
+
+
+LINEAR_LAW = Law(
+    kind="linear",
+    title="linear spring",
+    params=(replace(K0, what="slope", branch="", example="60 MPa"),),
+    numbered=BRANCH_NAMES,
+    functions="linear",
+    branches={"line": "linear"},
+    hysteretic=False,
+    spring=LinearSpring,
+    compared=(COMPARED_K0, COMPARED_ETA, COMPARED_HEIGHT),
+    inner_loops=False,
+    remembers=False,
+    published=True,
+)  # fmt: skip
+UNILATERAL_LAW = replace(
+    LINEAR_LAW, kind="unilateral", title="linear spring without tension", spring=_unilateral,
+    functions="unilateral",
+    branches={"line": "linear", "open": "out of contact"},
 )  # fmt: skip

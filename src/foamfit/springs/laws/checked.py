@@ -15,7 +15,7 @@ from foamfit.solve.histories import stress_along
 from foamfit.springs.compiled import solver_row
 from foamfit.springs.compiled.contract import MOST_INTERNAL
 from foamfit.springs.laws.record import ADMISSIBLE, COMMON, Functions, Law, Param
-from foamfit.springs.spring import LawSpring
+from foamfit.springs.spring import LawSpring, first_infinite
 
 SCALES = {"one": 1.0, "strain": 0.5, "stress": 1e6, "slope": 2e6, "damping": 1e3, "duration": 1e-3}
 _UP = np.linspace(0.0, 0.5, 101)
@@ -128,8 +128,7 @@ def _trial(law: Law) -> str | None:
         stress, branches = stress_along(law, LawSpring(law, [*values, 0.0]).row, TRIED)
     except Exception as error:  # any error of the compiler in a user's function
         return f"its functions cannot be compiled or run ({type(error).__name__}: {_told(error)})"
-    if not np.all(np.isfinite(stress)):
-        at = int(np.argmin(np.isfinite(stress)))
+    if (at := first_infinite(stress)) is not None:
         return f"the stress is not finite at the strain {TRIED[at]:g} ({shown})"
     if branches.min() < 0 or branches.max() >= len(law.numbered or law.branches):
         return f"a branch has the number {branches.max()}, but branches names {len(law.branches)}"
