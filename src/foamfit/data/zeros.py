@@ -33,6 +33,7 @@ _FEWEST = 3  # least number of rows for a zero
 _FEW = 20  # with fewer rows before contact, a flat end of the record gives a better zero
 _TAIL = 0.04  # share of a record taken as its end
 _FLAT = 3.5  # most slope of a flat end, in standard errors
+_EXACT = 1e-6  # noise of a channel, as a share of its range, below which it is exact
 _HIGHEST = 0.1  # highest level of the end, as a share of the range
 _DRIFTS = 0.005  # share of its range by which a stress that drifts changes at least
 _MATTERS = 0.01  # relative gain of velocity in a fall above which gravity must be specified
@@ -154,8 +155,9 @@ def take_zeros(
             if abs(zero.value) > (0.0 if top else 1e-3 * np.ptp(values)):
                 label, size = "The displacement" if top else name, engineering(zero.value, "m")
                 note = f"{label} at contact, {size}, is taken off ({source})."
-        if not impact and start.by == "file" and not zero.samples and values[0] == 0.0:
-            errors[name] = noise.sigma  # set to zero at its first row, whose noise it contains
+        tared = not impact and start.by == "file" and not zero.samples and values[0] == 0.0
+        if tared and noise.sigma > _EXACT * np.ptp(values):
+            errors[name] = noise.sigma  # that of the first row, which was set to zero
         record = record.shifted(name, zero.value).noted(*[note] * bool(note))
     return replace(record, zeros=errors)
 
