@@ -21,10 +21,11 @@ from foamfit.fitting.box import Space
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.starts import (
     CURVE_STARTS,
+    Reading,
+    Start,
     apart,
     around,
     box_starts,
-    curve_starts,
     far_off,
     neighbours,
     off_edges,
@@ -55,6 +56,7 @@ PROMISING = 100.0
 # the work.
 STAGES = ((8, 0.5, 0.5), (8, 0.25, 0.25), (24, 0.25, 0.25))
 HALFWAY = STAGES[0][2]
+ADJUSTED = 24  # starts of springs in series whose places are adjusted
 LEAST = 6  # descents that go on in any case
 FEWER = 4  # divisor of the number of starts if a poorer model has found good ones
 
@@ -210,6 +212,36 @@ def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[floa
     return sorted(
         ((float(r @ r), p) for r, p in zip(residuals, points, strict=True)), key=itemgetter(0)
     )
+
+
+def start_points(
+    tracker: Tracker, points: list[Array], reading: Reading, rng: np.random.Generator
+) -> list[tuple[float, Array]]:
+    """Return points and starts read off the loop with their costs, cheapest first.
+
+    Springs in series share the loop, so the right places of all of them are rarely drawn at once:
+    in the best of these starts one place after the other is adjusted.
+    """
+    space, read = reading.space, reading.starts(rng)
+    ranked = rank(tracker, space, points + [one.point for one in read])
+    if has_several(space.model):
+        known = {id(one.point): one for one in read if one.in_series}
+        best = [(cost, known[id(point)]) for cost, point in ranked if id(point) in known]
+        ranked += [adjusted(tracker, reading, one, rng) for one in best[:ADJUSTED]]
+    return sorted(ranked, key=itemgetter(0))
+
+
+def adjusted(
+    tracker: Tracker, reading: Reading, start: tuple[float, Start], rng: np.random.Generator
+) -> tuple[float, Array]:
+    """Return cost and point of a start after each of its marks was moved to the best place."""
+    cost, best = start
+    for at in rng.permutation(reading.size):
+        for other in reading.others(best, int(at)):
+            residual = tracker.residual(reading.space.decode(other.point))
+            if (found := float(residual @ residual)) < cost:
+                cost, best = found, other
+    return cost, best.point
 
 
 def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
@@ -395,8 +427,7 @@ def _search_loop(
         own = replace(space, free=tuple(one for one in space.free if one not in NUISANCE))
     try:
         points = [own.encode(space.decode(point)) for point in points]
-        ranked = rank(inner, own, points + curve_starts(own, loop, rng))
-        points = [point for _, point in ranked]
+        points = [point for _, point in start_points(inner, points, Reading(own, loop), rng)]
 
         def step(share: float) -> None:
             progress(DESCENTS + (ON_CURVES - DESCENTS) * share, "loop")

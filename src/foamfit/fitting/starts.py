@@ -6,8 +6,10 @@ Other points lie beside the best one found: the search may have ended in a wrong
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -25,6 +27,7 @@ from foamfit.springs.parameters import family, relaxation_names, split_name
 LOOP_SAMPLES = 300
 CURVE_STARTS = 300
 OWN_MARKS = 5  # random numbers per spring; further ones that a law needs are appended
+LEVELS = (np.arange(7) + 0.5) / 7  # other places of a mark
 # Range of random start values of nuisance parameters, and of the time shift.
 NEAR_USUAL, LATE = (-0.05, 0.05), (-0.3, 0.3)
 AROUND = 200  # random points around the best one
@@ -78,43 +81,74 @@ def thinned(
     )  # fmt: skip
 
 
-def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> list[Array]:
-    """Return start points read off the measured loop at places from a Latin hypercube.
+class Start(NamedTuple):
+    """A start point read off a loop, and the assumed places, `marks` in [0, 1]."""
 
-    Linear springs take a random fraction of the largest displacement; each hysteretic spring is
-    read off the remaining loop, at its own random places.
+    point: Array
+    marks: Array
+    way: int
+    in_series: bool  # whether its springs are read off the kinks of their common loop
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """Reads start points off a measured loop.
+
+    Linear springs take a fraction of the largest displacement; each hysteretic spring is read off
+    the remaining loop, at its own places.
     """
-    assert loop.displacement is not None
-    assert loop.stress is not None
-    model, index, laws = space.model, space.model.index, space.model.laws
-    count, relaxing = len(laws), 2 * model.relaxation * sum(law.hysteretic for law in laws)
-    more = sum(max(law.wanted_marks - OWN_MARKS, 0) for law in laws if law.hysteretic)
-    marks = qmc.LatinHypercube(7 * count + more + relaxing, rng=rng).random(CURVE_STARTS)
-    starts, once, begun = [], next(iter(cycles_of(loop).values()), slice(None)), loop.displacement
-    if late := space.values[space.names.index(TIME_SHIFT)] if TIME_SHIFT in space.names else 0.0:
-        begun = np.interp(loop.instants + late, loop.instants, begun)
-        begun = begun - space.values[space.names.index("displacement_zero")]
-    lines = [law.own == ("k0",) for law in laws]
-    ways = range(max(law.ways for law in laws))
-    for (turn, mark), way in product(enumerate(marks), ways):
-        values = space.values.copy()
-        heights = np.full(count, space.scales.height / count)
-        if count > 1:
-            given = [index[f"s{i}_height"] for i in range(1, count + 1)]
+
+    space: Space
+    loop: Measurement
+
+    @cached_property
+    def _curves(self) -> tuple[Array, Array]:
+        """Motion (m) and stress (Pa) of the first cycle, without the delay of the motion."""
+        space, loop = self.space, self.loop
+        assert loop.displacement is not None
+        assert loop.stress is not None
+        once, motion = next(iter(cycles_of(loop).values()), slice(None)), loop.displacement
+        at = {name: float(value) for name, value in zip(space.names, space.values, strict=True)}
+        if late := at.get(TIME_SHIFT, 0.0):
+            motion = np.interp(loop.instants + late, loop.instants, motion)
+            motion = motion - at["displacement_zero"]
+        return motion[once], loop.stress[once]
+
+    @cached_property
+    def _whole(self) -> Loop:
+        """The loop without linear springs."""
+        motion, stress = self._curves
+        return Loop(motion / self.space.scales.height, stress)
+
+    @cached_property
+    def size(self) -> int:
+        """Number of marks of a start."""
+        model, laws = self.space.model, self.space.model.laws
+        relaxing = 2 * model.relaxation * sum(law.hysteretic for law in laws)
+        more = sum(max(law.wanted_marks - OWN_MARKS, 0) for law in laws if law.hysteretic)
+        return 7 * len(laws) + more + relaxing
+
+    def start(self, mark: Array, way: int, *, in_series: bool) -> Start:
+        """Return the start point at some places."""
+        space, model, laws = self.space, self.space.model, self.space.model.laws
+        values, lines = space.values.copy(), [law.own == ("k0",) for law in laws]
+        heights = np.full(len(laws), space.scales.height / len(laws))
+        if len(laws) > 1:
+            given = [model.index[f"s{i}_height"] for i in range(1, len(laws) + 1)]
             for i, at in enumerate(given):
                 if model.names[at] in space.free:
                     values[at] = heights[i] * (0.3 + 1.4 * mark[7 * i + 5])
             values = space.complete(values)
             heights = np.maximum(values[given], 1e-3 * space.scales.height)
-        motion, stress = begun[once], loop.stress[once]
-        for i in range(count):
-            if lines[i]:
-                share = 10.0 ** (-3.0 + 2.7 * mark[7 * i + 6])
-                k0 = heights[i] * space.scales.stress / (share * motion.max())
-                values[index[f"s{i + 1}_k0"]] = k0
-                motion = motion - heights[i] * stress / k0
+        motion, stress = self._curves
+        for i in np.flatnonzero(lines).tolist():
+            share = 10.0 ** (-3.0 + 2.7 * mark[7 * i + 6])
+            k0 = heights[i] * space.scales.stress / (share * motion.max())
+            values[model.index[f"s{i + 1}_k0"]] = k0
+            motion = motion - heights[i] * stress / k0
         soft = sum(h for h, line in zip(heights, lines, strict=True) if not line)
-        left, rest = Loop(motion / (soft or 1.0), stress), iter(mark[7 * count :])
+        left = Loop(motion / (soft or 1.0), stress) if any(lines) else self._whole
+        rest = iter(mark[7 * len(laws) :])
         for i, law in enumerate(laws):
             if lines[i]:
                 continue
@@ -123,7 +157,8 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
             own = model.own(i, values)
             if law.read_off is None:
                 own[:] = _anywhere(space, law, places)
-            elif law.read_in_series is not None and soft > heights[i] and turn % 2:
+            elif law.read_in_series is not None and soft > heights[i] and in_series:
+                places = np.append(places, mark[7 * i + 6])
                 own[:] = law.read_in_series(left, places, heights[i] / soft)
             else:
                 own[:] = law.read_off(left, places, space.scales, way)
@@ -131,8 +166,25 @@ def curve_starts(space: Space, loop: Measurement, rng: np.random.Generator) -> l
             for at in range(terms, terms + 2 * model.relaxation * law.hysteretic, 2):
                 values[at] = 10.0 ** (1.5 * next(rest) - 1.5)
                 values[at + 1] = space.scales.duration * 10.0 ** (2.0 * next(rest) - 2.5)
-        starts.append(space.encode(values))
-    return starts
+        return Start(space.encode(values), mark, way, in_series)
+
+    def starts(self, rng: np.random.Generator) -> list[Start]:
+        """Return starts at places from a Latin hypercube."""
+        marks = qmc.LatinHypercube(self.size, rng=rng).random(CURVE_STARTS)
+        ways = range(max(law.ways for law in self.space.model.laws))
+        return [
+            self.start(mark, way, in_series=turn % 2 == 1)
+            for (turn, mark), way in product(enumerate(marks), ways)
+        ]
+
+    def others(self, one: Start, at: int) -> Iterator[Start]:
+        """Yield the start with one of its marks at other places, if the point changes."""
+        for level in LEVELS:
+            marks = one.marks.copy()
+            marks[at] = level
+            other = self.start(marks, one.way, in_series=one.in_series)
+            if np.any(other.point != one.point):
+                yield other
 
 
 def _anywhere(space: Space, law: Law, marks: Array) -> Array:

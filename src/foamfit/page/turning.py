@@ -16,7 +16,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import Tracker, rank
-from foamfit.fitting.starts import curve_starts, thinned
+from foamfit.fitting.starts import Reading, thinned
 from foamfit.one_model import Options
 from foamfit.options import Keywords
 from foamfit.parts import law_in_words
@@ -146,9 +146,9 @@ class Turning:
         if problem.measurement.displacement is None:
             return problem.vector()
         rng = np.random.default_rng(0)
-        starts = curve_starts(space, thinned(problem.measurement, loop=True), rng)
+        starts = Reading(space, thinned(problem.measurement, loop=True)).starts(rng)
         tracker = Tracker(problem.objective)
-        rank(tracker, space, starts)
+        rank(tracker, space, [one.point for one in starts])
         return np.asarray(problem.vector() if tracker.best_values is None else tracker.best_values)
 
     def _row(self, name: str) -> Row:

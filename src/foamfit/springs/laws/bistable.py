@@ -156,8 +156,9 @@ def read_in_series(loop: Loop, marks: Array, share: float) -> Array:
     """Read one of several springs in series off the kinks of their common loop.
 
     While a spring with a `share` of the height snaps, the others stay on their branches, so the
-    loop bends at the stresses of A1, C1, C2 and A2. `marks` (5,) in [0, 1] select these among the
-    kinks, and k_c. Returns k0 … kh_minus and eta = 0 (SI).
+    loop bends at the stresses of A1, C1, C2 and A2. `marks` (6,) in [0, 1] select these among the
+    kinks, k_c, and k0: that of the loop, or stiffer than if the spring alone were soft. Returns k0
+    … kh_minus and eta = 0 (SI).
     """
 
     def pick(kinks: Array, mark: float) -> tuple[float, float]:
@@ -172,7 +173,8 @@ def read_in_series(loop: Loop, marks: Array, share: float) -> Array:
     (from_x, sigma_a), (to_x, sigma_hat_c) = pick(at_a1, marks[0]), pick(at_c1, marks[1])
     (_, sigma_c), (_, sigma_e) = pick(at_c2, marks[2]), pick(at_a2, marks[3])
     early = 0.05 * float(np.max(loop.strain))
-    k0 = max(loop.at(early, loading=True) / early, sigma_a)
+    k0 = loop.at(early, loading=True) / early
+    k0 = max(k0, sigma_a) if marks[5] < 0.5 else share * k0 * 10.0 ** (3.0 * marks[5] - 1.5)
     kc = k0 * 10.0 ** (0.3 + 1.7 * marks[4])
     sigma_c, sigma_e = min(sigma_c, 0.98 * sigma_a), min(sigma_e, 0.9 * sigma_c, 0.9 * sigma_a)
     sigma_hat_c = max(sigma_hat_c, 1.001 * sigma_a)
