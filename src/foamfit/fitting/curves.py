@@ -15,7 +15,7 @@ from foamfit.arrays import Array
 from foamfit.data.calibration import contradictions
 from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel, is_clipped
 from foamfit.data.motion import SmoothMotion, follow
-from foamfit.data.noise import TENSION, lowest_mean
+from foamfit.data.noise import TENSION, lowest_mean, residual_noise
 from foamfit.errors import InputError
 from foamfit.options import DRIVES
 from foamfit.solve.scene import Motion
@@ -219,7 +219,8 @@ def driving_motion(
         apart = np.abs(time[:, None] - found.turns).min(axis=1) > 0.75 * gap
         counts = apart if counts is None else counts & apart
         found = follow(time, values, level, counts)
-    return found if always or found.sigma <= FOLLOWED * level.sigma else None
+    noise = level.sigma if level.given else max(level.sigma, residual_noise(values)[0])
+    return found if always or found.sigma <= FOLLOWED * noise else None
 
 
 def moved_at(instants: Array, time: Array, values: Array, motion: SmoothMotion | None) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from foamfit.data.calibration import contradictions
 from foamfit.data.cycles import inner_loops
 from foamfit.data.energy import audit, noise_sentences
-from foamfit.data.measurement import INTEGRATED, interior_channel
+from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel
 from foamfit.data.zeros import UNDER_LOAD
 from foamfit.errors import SimulationError
 from foamfit.fitting.branches import visited
@@ -228,6 +228,7 @@ def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict
     return {
         "stopped": not intervals.ranged,
         "vibrates": objective.interior_mass,
+        "rounded": objective.drive == "stress" and objective.scenes.smooth and _is_led(test),
         "begun": (model.relaxation or objective.drive == "impact")
         and any(UNDER_LOAD in note for note in test.notes),
         "ended": ended if errs and objective.drive != "impact" and ended > UNDER else 0.0,
@@ -236,6 +237,19 @@ def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict
         "off": misfit if misfit > POOR else 0.0,
         "curve": curve,
     }
+
+
+def _is_led(test: Measurement) -> bool:
+    """Return whether the machine led the motion: loading is straighter in motion than in stress.
+
+    Such a stress bends where the springs switch, and smoothing rounds its bends.
+    """
+    if test.displacement is None or test.stress is None:
+        return False
+    n = int(np.argmax(test.displacement)) + 1
+    curves = np.column_stack((test.displacement[:n], test.stress[:n]))
+    _, off, *_ = np.polyfit(test.instants[:n], curves / np.ptp(curves, axis=0), 1, full=True)
+    return bool(off[0] < off[1])
 
 
 def _estimates(
