@@ -23,6 +23,7 @@ from foamfit.text import (
     ("made", "text"),
     [
         (engineering(3.839e6, "Pa"), "3.839 MPa"),
+        (engineering(999960.0, "Pa"), "1 MPa"),
         (engineering(0.0, "m"), "0 m"),
         (engineering(-2e-6, "m"), "-2 µm"),
         (engineering(1e12, "Pa"), "1000 GPa"),

@@ -18,8 +18,8 @@ _PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n"}
 
 def engineering(value: float, unit: str) -> str:
     """Write a value with four digits and a prefix: 3.839e6, "Pa" gives "3.839 MPa"."""
-    exponent = math.log10(abs(value)) if value and math.isfinite(value) else 0.0
-    power = min(max(3 * math.floor(exponent / 3.0), -9), 9)
+    exponent = int(f"{value:.3e}".partition("e")[2]) if math.isfinite(value) else 0  # as rounded
+    power = min(max(3 * (exponent // 3), -9), 9)
     return f"{value / 10.0**power:.4g} {_PREFIXES[power]}{unit}"
 
 

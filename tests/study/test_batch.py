@@ -313,7 +313,7 @@ def test_killed_and_called_again_nothing_is_lost_or_done_twice(here, tried, monk
     words = ["batch", "tests", "--specimen", "foam.toml", "--starts", "2", "--jobs", "2"]
     words += ["--no-report", "--quiet", "--out", "out"]
     with subprocess.Popen([sys.executable, "-m", "foamfit", *words]) as process:
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 180
         while not stamps("out") and time.monotonic() < deadline:
             time.sleep(0.02)
         others = psutil.Process(process.pid).children(recursive=True)

@@ -32,7 +32,7 @@ from foamfit.study.joint_result import Alternative, JointResult, result_of
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
 from foamfit.trust import covariance
-from foamfit.trust.settle import keep_to_record, weigh_motion
+from foamfit.trust.settle import keep_to_record, weigh_motion, weigh_priors
 
 # Number of tests fitted by a full search; the others start at the results of these.
 SEARCHED = 3
@@ -240,7 +240,8 @@ def _own_fits(
             try:
                 found[t] = _own_fit(tests[t], study.model, options, near)
             except SimulationError as error:
-                refused[str(tests[t].file)] = str(error)
+                if t not in found:
+                    refused[str(tests[t].file)] = str(error)
             tell(done + 0.2 * (i + 1) / len(chosen), "each test")
 
     do(first, (), 0.1)
@@ -274,6 +275,7 @@ def _own_fit(test: _Test, model: str, options: Options, near: tuple[Array, ...])
     if tracker.best_values is None:
         return _own_fit(test, model, options, ())
     problem, _ = keep_to_record(problem, tracker, options.vary)
+    problem = weigh_priors(problem, tracker)
     weigh_motion(problem, tracker)
     return test.fitted(problem, tracker, tracker.best_values)
 
