@@ -100,10 +100,11 @@ def condition(
         record = cycles.zero_between(record, found, used)
         record = cycles.cut_to_cycle(record, found, chosen) if chosen else record
         record = cut_to_contact(record, start, span)
-    record = zeros.mark_flight(record, start, span, levels) if impact else record
-    record = integrate_motion(record, specimen, given)
-    record = start_within_height(record, specimen, given) if impact else record
-    record = record if impact else replace(record, acceleration=None)
+    if impact:
+        record = zeros.mark_flight(record, start, span, levels)
+        record = start_within_height(integrate_motion(record, specimen, given), specimen, given)
+    else:
+        record = replace(integrate_motion(record, specimen, given), acceleration=None)
     whole = checks(record, specimen, several=used.last is not None)
     whole, block = blocks.without_holds(whole, impact=impact)
     record = blocks.thin(whole, block)

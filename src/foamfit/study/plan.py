@@ -114,10 +114,12 @@ def plan(
     known = known_of(tests, rng, DRAWS)
     others = {name: known_of([one], rng, 0) for name, one in rivals.items()}
     target = None if quantity is None else gain.Target.of(quantity, known, limits)
-    seen = list[Seen]()
-    for i, one in enumerate(asked):
+
+    def look(i: int, one: Candidate) -> Seen:
         progress(0.05 + 0.85 * i / len(asked), f"{counted(len(asked), 'candidate')}, {i} done")
-        seen.append(gain.look(known, one, limits, others))
+        return gain.look(known, one, limits, others)
+
+    seen = list(map(look, range(len(asked)), asked))
 
     contradicted = known.missed > 0.0 and any(x.fit and x.fit.contradictions for x in tests)
 
@@ -135,9 +137,9 @@ def plan(
     best = _advised(outcomes, safe, sum(one.probability for one in now.values())) if safe else None
     pair = _pair(known, outcomes, seen, safe)
     progress(0.92, "what no test of this rig determines")
-    shown = {name for i in safe for name in outcomes[i].determined}
-    shown |= {name for name, one in now.items() if one.state == "determined"}
-    left = [name for name in known.names if name not in shown]
+    shown = [now, *(outcomes[i].expected for i in safe)]
+    sure = {name for each in shown for name, one in each.items() if one.state == "determined"}
+    left = [name for name in known.names if name not in sure]
     never = _beyond(known, left, limits, impacts=not contradicted)
     progress(0.97, "the velocity that closes the loop")
     return Plan(
