@@ -1,7 +1,5 @@
 """Shared synthetic tests: simulated impacts and loops with known noise."""
 
-from __future__ import annotations
-
 import functools
 import gc
 import os

@@ -1,7 +1,5 @@
 """Figures of every kind, drawn from fabricated results and fast simulations."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A fabricated fit: the spring law along a half-sine motion, with a little noise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

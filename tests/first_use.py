@@ -3,8 +3,6 @@
 conftest.py runs this script in parallel processes, before or during the tests.
 """
 
-from __future__ import annotations
-
 import gc
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The ladder: runs test, effective parameters, known structures, interruption and output."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re

@@ -1,7 +1,5 @@
 """A material card: its curves, unloading, text as read by the solver, and loss of accuracy."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator

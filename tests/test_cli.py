@@ -1,7 +1,5 @@
 """The command line as a user calls it: printed output, written files and error messages."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Several cycles as one history, and springs with memory, from the file to the prediction."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

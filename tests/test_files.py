@@ -1,7 +1,5 @@
 """Files are written completely, never replace foreign files, and leave no remnants."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

@@ -1,7 +1,5 @@
 """A user-defined law from the file given by --law is available to all commands and processes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

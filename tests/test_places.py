@@ -1,7 +1,5 @@
 """Where `foamfit fit` puts a result, which older result it replaces, and which it leaves alone."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

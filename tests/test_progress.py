@@ -1,7 +1,5 @@
 """The progress line of a fit on a terminal, and cases in which no line is shown."""
 
-from __future__ import annotations
-
 import logging
 import os
 import re

@@ -1,7 +1,5 @@
 """Robustness of a fit to outliers, a time shift and interruption."""
 
-from __future__ import annotations
-
 import signal
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Results read back from files, and their display in Python."""
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace

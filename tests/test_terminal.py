@@ -1,7 +1,5 @@
 """Terminal output: all encodings, no control characters, exit codes, and --open."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

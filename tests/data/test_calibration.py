@@ -1,7 +1,5 @@
 """Contradictions between velocity, mass, force and motion, in records of a simulated rig."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from pathlib import Path
 

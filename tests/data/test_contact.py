@@ -1,7 +1,5 @@
 """The start of an impact and the zeros found before it, for synthetic pulses in closed form."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The TOML that `foamfit init` drafts: it proposes a column only if no other can be meant."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

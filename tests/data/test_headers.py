@@ -1,7 +1,5 @@
 """Headers of several rows, line ends, and files that look like a table but contain more or less."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Smooth motions and strain rates from noisy displacements, compared with known motions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Noise and outliers of a channel, compared with known noise and added outliers."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -4,8 +4,6 @@ The records are written by plain NumPy: a foam that is stiffer in loading than i
 motions that machines and strikers make.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 from pathlib import Path

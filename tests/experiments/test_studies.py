@@ -1,7 +1,5 @@
 """Studies whose models know nothing of foamfit: rigs, micro-springs and the claims of the paper."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

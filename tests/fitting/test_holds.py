@@ -1,7 +1,5 @@
 """Slow tests of a relaxing foam with holds, rests, steps and many cycles, read from files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A result as lmfit's objects: report, correlations, and confidence intervals by lmfit alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import lmfit

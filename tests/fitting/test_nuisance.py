@@ -1,7 +1,5 @@
 """Nuisance parameters: priors, rows averaged in blocks, and noise of a driving motion."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The objective: channels counted, their scale, and the penalty for failed simulations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A prior on a parameter counts as one residual."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

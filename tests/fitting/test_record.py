@@ -4,8 +4,6 @@ The records are made by the formulas below: a foam that is crushed, recovers lit
 from before the contact with arbitrary zeros and noise in each channel.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

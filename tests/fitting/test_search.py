@@ -1,7 +1,5 @@
 """The fit: recovery, repeatability, states, fixed values and interruption."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import lmfit

@@ -1,7 +1,5 @@
 """Two springs in series: exchanges between springs, and intervals that hold the truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

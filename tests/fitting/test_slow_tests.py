@@ -1,7 +1,5 @@
 """Slow tests of microscale springs: arbitrary zeros, glued specimens and inner loops."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Comparison of fits with published values and with each other: values, errors, omissions."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

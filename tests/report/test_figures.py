@@ -1,7 +1,5 @@
 """Figures for print: widths, room, editable text, distinguishable colours."""
 
-from __future__ import annotations
-
 from itertools import combinations
 from pathlib import Path
 from typing import Any

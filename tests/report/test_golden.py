@@ -6,8 +6,6 @@ rewrites the files; check the changes with `git diff tests/golden` before commit
 The results are fabricated, so that no number depends on a search or on the machine.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The report as a page: what it shows and hides, and what the terminal shows of a result."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Chains of linear springs against closed forms."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Gravity on a striker by all solvers, with derivatives, against an independent integration."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Chains with memory under a prescribed motion: narrow snaps, equal springs, origins of time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Chains of springs with memory: the explicit integrator against an independent one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

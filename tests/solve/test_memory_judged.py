@@ -1,7 +1,5 @@
 """Springs with memory: simulations against the brute-force judge."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """First use: a fit calls exactly the loops that are compiled while a test is read."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """Springs with relaxation against brute-force steps, closed forms and quadrature."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A seeded subset of experiments/stability: stiff and extreme scenes, and the judges."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

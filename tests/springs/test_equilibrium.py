@@ -1,7 +1,5 @@
 """Springs in series in equilibrium: every switch is followed, however coarse the samples."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

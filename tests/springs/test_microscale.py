@@ -1,7 +1,5 @@
 """The microscale law against root finding on an independent implementation of the law."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """User-defined laws: registration from a file, refusals, simulation and fits."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import pickle

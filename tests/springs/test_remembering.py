@@ -5,8 +5,6 @@ explicit, and the stress at a strain is found by bracketing. `discrete` follows 
 micro-springs.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

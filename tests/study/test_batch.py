@@ -1,7 +1,5 @@
 """Batches: each result is complete or absent and made once, whatever fails; and the summary."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import json

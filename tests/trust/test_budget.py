@@ -1,7 +1,5 @@
 """Effect of the ± of the TOML on the parameters, compared with exact scalings and refits."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A contradiction in a record: default drive, first warning, printed lines and states."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

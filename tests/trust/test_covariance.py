@@ -1,7 +1,5 @@
 """Autocorrelation, covariance and states, compared with closed-form results."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.linalg import toeplitz

@@ -1,7 +1,5 @@
 """Identifiability, checked by closed forms, energy, an independent integration and refits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

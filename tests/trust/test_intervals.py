@@ -1,7 +1,5 @@
 """Profiles and Markov chains compared with closed forms, each other and independent refits."""
 
-from __future__ import annotations
-
 import csv
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """Separation of noise from errors of the law, and the ranges that such errors cause."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache
