@@ -47,7 +47,10 @@ def test_cycles_are_read_as_one_history(record: Path) -> None:
         assert test.displacement[part].max() == pytest.approx(0.55 * HEIGHT, rel=0.01)
     later = ff.read_test(record, cycles=(2, 3))
     assert list(cycles_of(later)) == [2, 3]
-    assert len(cycles_of(ff.read_test(record, cycle=2))) == 0
+    alone = ff.read_test(record, cycle=2)
+    assert len(cycles_of(alone)) == 0
+    found = ff.fit(alone, model="microscale", mullins=True, starts=1, intervals="local")
+    assert any("as if nothing had snapped before it" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(

@@ -151,7 +151,12 @@ class Options(Given):
         given = (self.drive, chosen or params, self.weights, self.interior_mass)
         more: Any = {"time_shift": self.time_shift, "relaxation": self.relaxation}
         more["priors"] = {**measurement.priors, **(self.priors or {})}
-        return make_problem(measurement, model, *given, **more)
+        problem = make_problem(measurement, model, *given, **more)
+        if self.mullins and measurement.last_cycle is None and (cycle := measurement.cycle) > 1:
+            note = f"Cycle {cycle} is fitted as if nothing had snapped before it; with --cycles "
+            note += f"1-{cycle} the springs remember the cycles before."
+            problem = replace(problem, notes=(*problem.notes, note))
+        return problem
 
 
 def part_of(progress: Progress, begin: float, end: float, prefix: str = "") -> Progress:
