@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -126,6 +127,11 @@ def test_curves_end_where_a_bistable_law_ends() -> None:
     made = {name: fabricated.estimate(name, value) for name, value in soft.items()}
     card = ff.card(replace(base, parameters=base.parameters | made), format="csv")
     assert 0.8 < card.curves.strain[-1] < 0.87
+
+
+def test_nearly_equal_rates_share_a_curve() -> None:
+    rates = SimpleNamespace(rates=(0.24, 0.234, 2.4))
+    assert loading.fitted_rates(rates) == [0.234, 2.4]
 
 
 # ------------------------------------------------------------------------------- unloading

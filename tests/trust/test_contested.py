@@ -198,3 +198,13 @@ def test_an_impact_on_cartilage_says_which_numbers_are_wrong(tmp_path: Path) -> 
     assert impact.warnings[0].startswith("Check: the velocity is given as 0.9 m/s")
     springs = [one.state for name, one in impact.parameters.items() if name.startswith("s1_")]
     assert "determined" not in springs
+
+
+@needs_data
+def test_a_chain_counts_the_error_of_a_zero_that_is_held(tmp_path: Path) -> None:
+    """Its interval had noise alone, 200 Pa instead of 50 kPa."""
+    test = ff.read_test(records.place("turbo-comp-2", tmp_path))
+    result = ff.fit(test, model="linear", intervals="mcmc", draws=200)
+    one = result.parameters["s1_k0"]
+    assert "displacement_zero" not in result.problem.free()
+    assert one.ci95[1] - one.ci95[0] == pytest.approx(3.92 * one.stderr, rel=0.15)

@@ -92,8 +92,11 @@ def follow(
 
 def fitted_rates(source: Source) -> list[float]:
     """Return the rates of the fitted tests, ascending, one for each group of nearly equal rates."""
-    rates = np.sort(source.rates)
-    return [float(rates[at]) for at in np.unique(np.round(np.log(rates) / _SAME), True)[1]]
+    rates: list[float] = []
+    for rate in sorted(map(float, source.rates)):
+        if not rates or rate > rates[-1] * (1.0 + _SAME):
+            rates.append(rate)
+    return rates
 
 
 def curves_at(source: Source, rates: Sequence[float], measured_to: float) -> tuple[Curves, bool]:

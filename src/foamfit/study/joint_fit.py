@@ -170,7 +170,9 @@ def ranges_of(point: JointPoint) -> dict[str, Ends]:
         if point.found.links.kind(name) == "shared":
             held = (_held(point, name, sign) for sign in (-1.0, 1.0))
             ends = [*held, point.found.common[name][0], *out.get(name, ())]
-            out[name] = min(ends), max(ends)
+            one = next(best for best in point.bests if name in best.problem.free())
+            low, high = np.clip([min(ends), max(ends)], *one.limits(name)).tolist()
+            out[name] = low, high
     return out
 
 

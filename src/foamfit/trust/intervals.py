@@ -239,11 +239,16 @@ def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
     note = chain.sentence([name for name in best.names if name not in best.known], few)
     if few:
         return Intervals(warnings=(note,))
-    low, high = np.percentile(chain.samples, [2.5, 97.5], axis=0).tolist()
+    drawn = chain.samples
+    if best.problem.kept:  # contact and zeros that are held are off by their errors, first order
+        moves = best.sizes[:, None] * (np.linalg.pinv(best.scaled, rcond=1e-10) @ best.shifts)
+        off = np.random.default_rng([choice.seed, 4]).standard_normal((len(drawn), moves.shape[1]))
+        drawn = np.clip(drawn - off @ moves.T, *best.box)
+    low, high = np.percentile(drawn, [2.5, 97.5], axis=0).tolist()
     pairs = zip(best.names, low, high, strict=True)
     ends = {name: (a, b) for name, a, b in pairs if name in best.known}
     fine = chain.converged and chain.stopped is None
-    samples = chain.samples.reshape(-1, chain.walkers, len(best.names)).T  # (k, walkers, steps)
+    samples = drawn.reshape(-1, chain.walkers, len(best.names)).T  # (k, walkers, steps)
     return Intervals(
         ends,
         dict.fromkeys(ends, "MCMC"),
