@@ -52,7 +52,7 @@ def record(folder: Path, name: str, copies: int = 1) -> Path:
     return write_csv(folder / "slow.csv", head, *rows, fmt="%.6f", toml=TOML)
 
 
-def fitted(path: Path, **chosen: object) -> ff.Fit:
+def fitted(path: Path, **chosen: object) -> ff.FitResult:
     test = ff.read_test(path, **chosen)
     return ff.fit(test, model="microscale", relaxation=1, intervals="local", starts=8)
 

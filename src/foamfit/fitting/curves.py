@@ -248,7 +248,7 @@ def driven_instants(measurement: Measurement, clock: Array, motion: SmoothMotion
     return np.union1d(clock, more) if more else clock
 
 
-def is_glued(measurement: Measurement) -> bool:
+def is_glued(measurement: Measurement, *, leaves: bool = True) -> bool:
     """Return whether the specimen is glued to its platens: a slow record shows tension."""
     stress, level = measurement.stress, measurement.noise.of("stress")
     if stress is None:
@@ -256,7 +256,9 @@ def is_glued(measurement: Measurement) -> bool:
     several = measurement.last_cycle is not None  # the first peak need not be the highest
     lowest, width = lowest_mean(stress, 0 if several else int(np.argmax(stress)))
     noise = 0.0 if level is None else 4.0 * level.sigma / math.sqrt(width)
-    return lowest < -max(TENSION * float(stress.max()), noise)
+    unknown = leaves or noise == 0.0 or stress[0] < -noise  # the zero may be off
+    least = TENSION * float(stress.max()) if unknown else 0.0
+    return lowest < -max(least, noise)
 
 
 def without_tension(motion: Motion) -> Motion:

@@ -116,9 +116,7 @@ class Scenes:
         self._dashpots = [i for i, name in enumerate(self.model.names[:-1]) if name.endswith("eta")]
         # Whether all samples share one clock and no reading is averaged.
         self._plain = self._fine == 1 and self._own is None
-        # Without relaxation a specimen has no reason to leave the platen within one cycle.
-        leaves = bool(self.model.relaxation) or test.last_cycle is not None
-        self._slack = leaves and not self.glued
+        self._slack = not self.glued
         self._one = np.array([test.specimen.height])
         self.plans = self._make(self._loading())
 
