@@ -134,8 +134,8 @@ class Objective:
         self._accelerated = self.drive == "impact" and test.acceleration is not None
         self.curves = (*CURVES, *((ACCELERATION,) if self._accelerated else ()), *self.interior)
         self.weights = checked_weights(self.weights, self.curves)
-        leaves = bool(self.model.relaxation) or test.last_cycle is not None
-        self.glued = is_glued(test, leaves=leaves) if self.glued is None else self.glued
+        leaves = self.drive == "impact" or self.model.relaxation or test.last_cycle is not None
+        self.glued = is_glued(test, leaves=bool(leaves)) if self.glued is None else self.glued
         self.scenes = Scenes(
             test, self.model, self.drive, self.curves, self.interior, self.nuisance, self.rtol,
             self.interior_mass, self.followed, self.averaged, self.glued,
