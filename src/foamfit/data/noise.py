@@ -16,6 +16,7 @@ from foamfit.data.measurement import Measurement, NoiseLevel
 
 MIN_REST = 20  # least number of samples for an estimate of their noise
 _WIDTHS = (5, 7, 11, 17, 25, 37, 55, 83, 125)  # of the local cubics, in samples
+EXACT = 1e-6  # noise of a channel, as a share of its range, below which it is exact
 TENSION = 0.02  # of the peak stress: the least that a specimen must bear to count as glued
 _SHARE = 12  # the widest cubic covers at most this fraction of the record, 1/12
 _CORRELATIONS = np.linspace(0.0, 0.98, 99)  # trial values of the lag-1 autocorrelation

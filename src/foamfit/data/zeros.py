@@ -17,6 +17,7 @@ from foamfit.data.measurement import (
     interior_channel,
 )
 from foamfit.data.noise import (
+    EXACT,
     MIN_REST,
     NOTHING,
     Level,
@@ -33,7 +34,6 @@ _FEWEST = 3  # least number of rows for a zero
 _FEW = 20  # with fewer rows before contact, a flat end of the record gives a better zero
 _TAIL = 0.04  # share of a record taken as its end
 _FLAT = 3.5  # most slope of a flat end, in standard errors
-_EXACT = 1e-6  # noise of a channel, as a share of its range, below which it is exact
 _HIGHEST = 0.1  # highest level of the end, as a share of the range
 _DRIFTS = 0.005  # share of its range by which a stress that drifts changes at least
 _MATTERS = 0.01  # relative gain of velocity in a fall above which gravity must be specified
@@ -156,7 +156,7 @@ def take_zeros(
                 label, size = "The displacement" if top else name, engineering(zero.value, "m")
                 note = f"{label} at contact, {size}, is taken off ({source})."
         tared = not impact and start.by == "file" and not zero.samples and values[0] == 0.0
-        if tared and noise.sigma > _EXACT * np.ptp(values):
+        if tared and noise.sigma > EXACT * np.ptp(values):
             errors[name] = noise.sigma  # that of the first row, which was set to zero
         record = record.shifted(name, zero.value).noted(*[note] * bool(note))
     return replace(record, zeros=errors)

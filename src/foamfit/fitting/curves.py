@@ -15,7 +15,7 @@ from foamfit.arrays import Array
 from foamfit.data.calibration import contradictions
 from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel, is_clipped
 from foamfit.data.motion import SmoothMotion, follow
-from foamfit.data.noise import TENSION, lowest_mean, residual_noise
+from foamfit.data.noise import EXACT, TENSION, lowest_mean, residual_noise
 from foamfit.errors import InputError
 from foamfit.options import DRIVES
 from foamfit.solve.scene import Motion
@@ -27,9 +27,8 @@ CURVES = ("stress_time", "displacement_time", "stress_strain")
 ACCELERATION = "acceleration_time"
 # Curves that need a motion.
 MOTION_CURVES = ("displacement_time", "stress_strain")
-# A motion with less noise than this fraction of its range is exact. A smooth motion is used if its
-# residuals are at most this multiple of the noise.
-EXACT, FOLLOWED = 1e-6, 1.5
+# A smooth motion is used if its residuals are at most this multiple of the noise.
+FOLLOWED = 1.5
 LOADED = 0.01  # share of the peak stress from which there certainly is load
 # Largest time between contact and the first sample, in sampling intervals, for which the simulation
 # starts at the contact.
@@ -248,8 +247,12 @@ def driven_instants(measurement: Measurement, clock: Array, motion: SmoothMotion
     return np.union1d(clock, more) if more else clock
 
 
-def is_glued(measurement: Measurement, *, leaves: bool = True) -> bool:
-    """Return whether the specimen is glued to its platens: a slow record shows tension."""
+def is_glued(measurement: Measurement, *, leaves: bool) -> bool:
+    """Return whether the specimen is glued to its platens: a slow record shows tension.
+
+    A specimen that may have left the platen (`leaves`), or whose zero of the force is uncertain, is
+    glued only if the tension is more than `TENSION` of the peak.
+    """
     stress, level = measurement.stress, measurement.noise.of("stress")
     if stress is None:
         return False

@@ -112,7 +112,7 @@ class Objective:
     nuisance: tuple[str, ...] = OF_DRIVE
     weighing: Weighing | None = None  # Effect of an uncertain driving motion; see `weigh_motion`
     given: tuple[nuisances.Prior, ...] = ()  # Priors of spring parameters
-    erring: bool = False  # Whether priors count as if the scale of the curves were their noise
+    erring: bool = False  # Whether the law errs, so that priors count by the scales of the curves
     followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is already known
     averaged: float = np.inf  # longest time that a sample averages, s, if the samples are thinned
     glued: bool | None = None  # see `is_glued`; None: as the record shows
