@@ -9,7 +9,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import NoiseLevel, Record
-from foamfit.data.noise import MIN_REST, level_on_line, noise_about, smooth
+from foamfit.data.noise import MIN_REST, noise_about, polynomial_at, smooth
 
 # A signal is at rest if its slope is less than this share of the slope that follows. The slopes of
 # the loading branches differ by a smaller factor (6 in the published sets), so a soft start is not
@@ -149,7 +149,7 @@ def leave_rest(
         if n < max(3 * noise.time, 5) or n >= rows:
             return None
         enough = n >= MIN_REST * noise.time  # to estimate the noise from these samples
-        slope = level_on_line(t[:n], y[:n], at, replace(noise, sigma=0.0) if enough else noise)
+        slope = polynomial_at(t[:n], y[:n], at, replace(noise, sigma=0.0) if enough else noise)
         size, error, rest = abs(slope[1].value), slope[1].error, float(y[:n].mean())
         high = _reached(y, 0.15)[0]
         high = high if t[high] > at else int(np.argmax(y))
@@ -183,7 +183,7 @@ def _first_motion(time: Array, w: Array, noise: NoiseLevel) -> tuple[float, bool
     """Return the initial value of a motion, from a line, and whether it is clearly not zero."""
     top = int(np.argmax(w))
     early = slice(0, straight(time, w, 0, max(_LINE, top // 12), noise))
-    first = level_on_line(time[early], w[early], time[0], noise)[0]
+    first = polynomial_at(time[early], w[early], time[0], noise)[0]
     least = max(ELSEWHERE * first.error, 0.02 * (float(w[top]) - first.value))
     return first.value, top >= 5 and abs(first.value) > least  # not with fewer samples
 
@@ -260,7 +260,7 @@ def _first_sample(record: Record, levels: Levels) -> Start:
     """Return the start of an impact whose record begins during or at contact."""
     time, stress, start = record.instants, record.stress, _at_first(record.instants)
     early = slice(0, max(5, _reached(stress, 0.2)[0]))
-    level, slope = level_on_line(time[early], stress[early], time[0], levels["stress"])
+    level, slope = polynomial_at(time[early], stress[early], time[0], levels["stress"])
     back = level.value / slope.value if slope.value > 0 else 0.0
     most = max(8 * (time[1] - time[0]), 0.15 * (time[np.argmax(stress)] - time[0]))
     if start.time == time[0] != 0 and back < most and level.value > _ERRORS * level.error:

@@ -122,8 +122,9 @@ def read_test(
             )
     spreads, entries = dict[str, float](), dict[str, Entry]()
     for part in parts:
-        spreads |= part.source.scale_spreads()
-        entries |= part.source.entries(part.section)
+        used = part.source.in_use()
+        entries |= used
+        spreads |= {f"{name}_scale": entry.spread for name, entry in used.items() if entry.spread}
     test = replace(
         test, name=settings.name, path=path, data_sha256=sha256, turned=turned,
         uncertainties=spreads | stated, priors=settings.priors, entries=entries,
@@ -156,8 +157,8 @@ def _read_motion(path: Path, toml: Path, motion: Motion, duplicates: str) -> Cha
     text = read_text(motion.file, f"in [motion] file of {toml.name} the CSV file of the motion")
     try:
         with naming(motion.file):
-            source = Source.of(text, motion.columns).of_motion()
-            return read_channels(source, duplicates, _MOTION, motion.delay)
+            source = Source.of(text, motion.columns, section=_MOTION).of_motion()
+            return read_channels(source, duplicates, motion.delay)
     except InputError as error:
         raise InputError(str(error).replace("[columns]", f"[{_MOTION}]")) from None
 

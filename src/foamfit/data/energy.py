@@ -13,7 +13,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.calibration import Contradiction, balance, contradictions
 from foamfit.data.measurement import INTEGRATED, UNITS, Measurement, Striker
-from foamfit.data.noise import line_at, noise_level
+from foamfit.data.noise import noise_level
 from foamfit.text import engineering, percent
 
 _OTHER_CYCLE = 0.95  # a motion falls below this share of its maximum between two cycles
@@ -152,7 +152,7 @@ def _momentum(test: Measurement, unloaded: bool) -> tuple[float | None, float | 
     # A gauge at rest again after contact no longer follows the striker.
     shown = np.flatnonzero(test.sampled.get("displacement", np.ones(len(w), dtype=bool)))
     last = shown[-max(5, len(shown) // 20) :]
-    rebound = -line_at(time[last], w[last], time[last[-1]])[1]
+    rebound = -float(np.polyfit(time[last] - time[last[-1]], w[last], 1)[0])
     if not (striker.mass and striker.velocity) or test.motion == INTEGRATED:
         return impulse, rebound, None
     fall = (striker.gravity or 0.0) * float(time[-1])

@@ -356,7 +356,7 @@ class Measurement(Samples):
     standstills: tuple[tuple[float, float], ...] = ()  #: first and last time (or sample) of each
     turned: tuple[str, ...] = ()  #: channels that were negative in compression
     priors: dict[str, str] = field(default_factory=dict)  #: of parameters, like "5.5 ± 0.1 MPa"
-    #: entries of [columns] by which "stress" and "displacement" are read
+    #: entries of [columns] by which "stress", "displacement", … are read
     entries: dict[str, Entry] = field(default_factory=dict)
     #: velocity of the striker by its motion before contact, and standard error, m/s; None if the
     #: gauge did not follow it

@@ -169,12 +169,6 @@ class Level(NamedTuple):
     error: float
     samples: int
 
-    def source(self, noise: NoiseLevel, shape: str) -> str:
-        """Return the value over the noise, and the fitted `shape`, as text for a note."""
-        size = abs(self.value) / noise.sigma if noise.sigma > 0 else np.inf
-        ratio = f"{size:.{0 if size >= 10 else 1}f} noise standard deviations; "
-        return f"{ratio if np.isfinite(size) else ''}{shape} {self.samples} samples"
-
 
 NOTHING = Level(0.0, 0.0, 0)
 
@@ -189,22 +183,17 @@ def mean_level(values: Array, noise: NoiseLevel) -> Level:
     return Level(zero, sigma * float(np.sqrt(min(time, n) / n)), n)
 
 
-def line_at(time: Array, values: Array, at: float) -> tuple[float, float]:
-    """Return the value at the time `at`, and the slope, of a line fitted to the samples."""
-    slope, level = np.polyfit(time - at, values, 1)
-    return float(level), float(slope)
-
-
-def level_on_line(time: Array, values: Array, at: float, noise: NoiseLevel) -> tuple[Level, Level]:
-    """Return value and slope of a signal at the time `at` from a line through samples nearby."""
-    n, t = len(time), time - time.mean()
-    spread = float(t @ t)
-    level, slope = line_at(time, values, at)
-    residual = values - level - slope * (time - at)  # includes curvature of the signal
-    scatter = max(noise.sigma, float(np.sqrt(residual @ residual / max(n - 2, 1))))
-    scatter *= float(np.sqrt(noise.time))
-    error = scatter * np.sqrt(1.0 / n + (at - time.mean()) ** 2 / spread)
-    return Level(level, float(error), n), Level(slope, float(scatter / np.sqrt(spread)), n)
+def polynomial_at(
+    time: Array, values: Array, at: float, noise: NoiseLevel, degree: int = 1
+) -> list[Level]:
+    """Return the coefficients, at a time, of a polynomial through samples: value, slope, …"""
+    n, t = len(time), time - at
+    found, variance = np.polyfit(t, values, degree, cov="unscaled")
+    left = values - np.polyval(found, t)  # includes what the polynomial does not follow
+    scatter = max(noise.sigma, float(np.sqrt(left @ left / max(n - degree - 1, 1))))
+    errors = scatter * np.sqrt(noise.time * np.diag(variance))
+    pairs = zip(found[::-1].tolist(), errors[::-1].tolist(), strict=True)
+    return [Level(value, error, n) for value, error in pairs]
 
 
 def integrated_twice(time: Array, rate: Array) -> tuple[Array, Array]:

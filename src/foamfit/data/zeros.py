@@ -21,9 +21,8 @@ from foamfit.data.noise import (
     MIN_REST,
     NOTHING,
     Level,
-    level_on_line,
-    line_at,
     mean_level,
+    polynomial_at,
     quantum,
     smooth,
 )
@@ -91,10 +90,10 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
     size = max(8, int(_TAIL * len(values)))
     step, n = max(4, size // 2), size
     level, rows = mean_level(values[-n:], noise), np.arange(n, dtype=np.float64)
-    slope = level_on_line(rows, values[-n:], 0.0, noise)[1]
-    bend, error = _bend(rows, values[-n:], noise)
-    if abs(slope.value) > _FLAT * slope.error or abs(bend) > _FLAT * error:
-        return None
+    for degree in (1, 2):
+        bend = polynomial_at(rows, values[-n:], 0.0, noise, degree)[-1]
+        if abs(bend.value) > _FLAT * bend.error:
+            return None
     while n + step < len(values) // 2:
         more = mean_level(values[-n - step : -n], noise)
         if abs(more.value - level.value) > float(np.hypot(more.error, level.error)):
@@ -106,12 +105,6 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
     if level.samples < MIN_REST:
         level = level._replace(error=max(level.error, noise.sigma))
     return level if abs(level.value) < _HIGHEST * float(np.ptp(values)) else None
-
-
-def _bend(rows: Array, values: Array, noise: NoiseLevel) -> tuple[float, float]:
-    """Return the quadratic coefficient of samples, and its standard error."""
-    (bend, *_), variance = np.polyfit(rows, values, 2, cov="unscaled")
-    return float(bend), noise.sigma * float(np.sqrt(noise.time * variance[0, 0]))
 
 
 def take_zeros(
@@ -179,7 +172,7 @@ def without_drift(record: Record, start: Start, levels: Levels) -> Record:
     n, time, stress, noise = start.resting, record.instants, record.stress, levels["stress"]
     if n < MIN_REST or "stress" in record.derived:
         return record
-    level, slope = level_on_line(time[:n], stress[:n], start.time, noise)
+    level, slope = polynomial_at(time[:n], stress[:n], start.time, noise)
     straight = stress - level.value - slope.value * (time - start.time)
     found, returned = contact_end(straight[start.first :], noise)
     end = start.first + found
@@ -191,7 +184,7 @@ def without_drift(record: Record, start: Start, levels: Levels) -> Record:
     if abs(after.value) > 3.0 * error or drift < max(4.0 * error, _DRIFTS * float(np.ptp(stress))):
         return record
     rest = np.r_[:n, end : len(stress)]
-    slope = level_on_line(time[rest], stress[rest], start.time, noise)[1]
+    slope = polynomial_at(time[rest], stress[rest], start.time, noise)[1]
     by = engineering(slope.value * apart, "Pa")
     note = f"The stress drifts by {by} from before contact to after it; this line is taken off."
     return record.noted(note).changed("stress", stress - slope.value * (time - start.time))
@@ -201,8 +194,8 @@ def _zero_at_rest(
     name: str, rest: Array, unit: str, size: float, noise: NoiseLevel
 ) -> tuple[Level, str]:
     """Return the zero of a stress or acceleration at rest; 0 if its drift is larger."""
-    n, zero, scatter, note = len(rest), mean_level(rest, noise), float(rest.std()), ""
-    slope = level_on_line(np.arange(n, dtype=np.float64), rest, 0.0, noise)[1]
+    n, zero, note = len(rest), mean_level(rest, noise), ""
+    slope = polynomial_at(np.arange(n, dtype=np.float64), rest, 0.0, noise)[1]
     rise = slope.value * n
     if abs(rise) > max(0.01 * size, 4 * slope.error * n):
         kept = abs(zero.value) <= abs(rise)
@@ -211,11 +204,9 @@ def _zero_at_rest(
         note += f"so {done}. "
         zero = Level(0.0 if kept else zero.value, float(np.hypot(zero.error, rise)), n)
     if zero.value:
-        ratio = f", {abs(zero.value) / scatter:.2g} times that" if scatter > 0 else ""
-        value, sigma, error = (engineering(v, unit) for v in (zero.value, scatter, zero.error))
-        how = f"{n} samples at rest with a standard deviation of {sigma}{ratio}"
-        note += f"The {name} before contact, {value}, is taken off as the sensor's offset ({how}; "
-        note += f"standard error {error})."
+        value, error = (engineering(v, unit) for v in (zero.value, zero.error))
+        note += f"The {name} before contact, {value} ± {error}, is taken off as the sensor's "
+        note += f"offset (mean of {n} samples at rest)."
     return zero, note.strip()
 
 
@@ -231,14 +222,13 @@ def _zero_of_motion(
     top = name == "displacement"
     rows = n if n >= _FEWEST else max(0, first - 2)
     if rows >= _FEWEST and (not top or start.gauge == "rest"):
-        zero = mean_level(values[:rows], noise)
-        return zero, zero.source(noise, "mean of") + " at rest before contact"
+        return mean_level(values[:rows], noise), f"mean of {rows} samples at rest before contact"
     flies = top and start.gauge == "flight"
     reach = max(5, (int(np.argmax(values)) - first) // (24 if flies else 12))
     reach = reach if impact else straight(time, values, first, reach, noise)
     near = slice(max(0, first - reach) if flies else first, first + reach)
-    zero = level_on_line(time[near], values[near], start.time, noise)[0]
-    source = zero.source(noise, "line through") + (" around it" if flies else " from there on")
+    zero = polynomial_at(time[near], values[near], start.time, noise)[0]
+    source = f"line through {zero.samples} samples {'around it' if flies else 'from there on'}"
     size, stress = float(np.ptp(values)), record.stress
     loaded = not impact and stress[:3].mean() > 0.05 * stress.max() and 0.0 < zero.value < size
     least = max(ELSEWHERE * zero.error, 0.1 * size if impact else 0.0)
@@ -255,11 +245,13 @@ def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker)
         return "other"
     top = int(np.argmax(w))
     early = slice(start.first, start.first + max(5, (top - start.first) // 6))
-    after = line_at(time[early], w[early], start.time)[1]
-    speed = striker.velocity or after
-    slope = level_on_line(time[:before], w[:before], start.time, levels["displacement"])[1]
+    slope, after = (
+        polynomial_at(time[rows], w[rows], start.time, levels["displacement"])[1]
+        for rows in (slice(before), early)
+    )
+    speed = striker.velocity or after.value
     # The stated velocity may be wrong, but the striker does not change its speed at contact.
-    for gauge, expected in (("flight", speed), ("flight", after), ("rest", 0.0)):
+    for gauge, expected in (("flight", speed), ("flight", after.value), ("rest", 0.0)):
         if abs(slope.value - expected) <= slope.error + 0.05 * speed:
             return gauge if slope.error < 0.2 * speed else "other"
     return "other"
@@ -302,7 +294,7 @@ def flight_of(
     gain = percent(share := GRAVITY * float(record.instants[span.end - 1] - start.time) / given)
     if w is not None and n >= 8:
         noise, t = levels["displacement"], record.instants[:n] - start.time
-        gravity, error = (2.0 * half for half in _bend(t, w[:n], noise))
+        gravity, error = (2.0 * half for half in polynomial_at(t, w[:n], 0.0, noise, 2)[2][:2])
         none = start.gauge == "flight" and 4.0 * error < GRAVITY
         if falls := gravity > 4.0 * error and abs(gravity - GRAVITY) < 0.2 * GRAVITY + 2.0 * error:
             starts, ends = "Before", ". The fit includes gravity."
@@ -315,7 +307,7 @@ def flight_of(
         if striker.gravity is None and (falls or none):
             striker = replace(striker, gravity=GRAVITY if falls else 0.0)
         fall = 0.5 * (striker.gravity or 0.0) * t**2
-        speed, error = level_on_line(t, w[:n] - fall, 0.0, noise)[1][:2]
+        speed, error = polynomial_at(t, w[:n] - fall, 0.0, noise)[1][:2]
         if striker.gravity is None:  # the line has the mean velocity of a fall
             error = float(np.hypot(error, 0.5 * GRAVITY * np.ptp(t)))
         flight = (float(speed), float(error)) if speed > 0.5 * given else None

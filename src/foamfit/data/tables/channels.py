@@ -46,8 +46,7 @@ _SMOOTHED = 30, 5  # least number of samples for a running median, and its width
 class Channels:
     """The channels of a file in SI, their rows in the file, the dropped rows, and notes.
 
-    Time of the test = time of the file + `delay`, s. `section` is the one of the TOML that
-    describes the columns.
+    Time of the test = time of the file + `delay`, s.
     """
 
     source: Source
@@ -55,7 +54,6 @@ class Channels:
     rows: Integers
     dropped: list[Dropped]
     notes: list[str]
-    section: str = "columns"
     delay: float = 0.0
 
     def engineering(self) -> dict[str, Array]:
@@ -68,9 +66,7 @@ class Channels:
         return self.numbers
 
 
-def read_channels(
-    source: Source, duplicates: str, section: str = "columns", delay: float = 0.0
-) -> Channels:
+def read_channels(source: Source, duplicates: str, delay: float = 0.0) -> Channels:
     """Read the channels of a table; for `duplicates` see `toml_file`."""
     table, cut = without_cut_row(source.table)
     factors = {channel: source.factor(channel) for channel in source.columns}
@@ -99,7 +95,7 @@ def read_channels(
         if duplicates == "average":
             numbers, rows = _averaged(numbers, rows, dropped, notes)
         check_time(numbers["time"], source.name("time"), rows)
-    return Channels(source, numbers, rows, dropped, notes, section, delay)
+    return Channels(source, numbers, rows, dropped, notes, delay)
 
 
 def engineering_strain(measure: str, strain: Array) -> Array:
@@ -174,17 +170,18 @@ def turn_negative(parts: list[Channels], window: Window) -> tuple[str, ...]:
     channels = {c: part.numbers[c] for c, part in owners.items()}
     time = parts[0].numbers.get("time")
     if time is not None:
-        clocks = {part.section: part.numbers["time"] + part.delay for part in parts}
+        clocks = {part.source.section: part.numbers["time"] + part.delay for part in parts}
         first = max(window.start, *(clock[0] for clock in clocks.values()))
         last = min(window.end, *(clock[-1] for clock in clocks.values()))
         time = time[(time >= first) & (time <= last)]
         if time.size < MIN_ROWS:
             return ()  # refused later
         for channel, part in owners.items():
-            channels[channel] = np.interp(time, clocks[part.section], channels[channel])
+            channels[channel] = np.interp(time, clocks[part.source.section], channels[channel])
     wrong, certain = negative_channels(channels, time)
-    entries = [f"{owners[c].source.sign_entry(c)} in [{owners[c].section}]" for c in wrong]
     if not certain:
+        sources = {c: owners[c].source for c in wrong}
+        entries = [f"{s.sign_entry(c)} in [{s.section}]" for c, s in sources.items()]
         raise InputError(
             f"{' and '.join(wrong)} change in opposite directions under load, and the record does "
             f"not show which of them is negative in compression: write {' or '.join(entries)}."
@@ -192,7 +189,7 @@ def turn_negative(parts: list[Channels], window: Window) -> tuple[str, ...]:
     for channel in wrong:
         part = owners[channel]
         if stated := part.source.stated_sign(channel):
-            remedy = f"it must be positive: leave {stated} out in [{part.section}]"
+            remedy = f"it must be positive: leave {stated} out in [{part.source.section}]"
             raise InputError(f"the {channel} is negative in compression; {remedy}.")
         what = "counts down" if part.numbers[channel].min() >= 0.0 else "is negative"
         what = f"The {channel} {part.source.name(channel)} {what} in compression"

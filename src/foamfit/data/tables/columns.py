@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -23,16 +24,18 @@ SOURCES = {"stress": ("stress", "force", "acceleration"), "displacement": _MOTIO
 
 @dataclass(frozen=True)
 class Source:
-    """A table, the column number of each channel, and the entries of [columns] in the TOML."""
+    """A table, the column number of each channel, and the entries in a `section` of the TOML."""
 
     table: Table
     columns: dict[str, int]
     given: dict[str, Entry]
+    section: str = "columns"
 
     @classmethod
     def of(
-        cls, text: Text, given: dict[str, Entry], unclear: dict[str, list[int]] | None = None
-    ) -> Source:
+        cls, text: Text, given: dict[str, Entry], unclear: dict[str, list[int]] | None = None,
+        section: str = "columns",
+    ) -> Source:  # fmt: skip
         """Find the table in the text of a file and the columns of the channels.
 
         If several columns could be a channel, they are added to `unclear`. Without that, this
@@ -40,7 +43,7 @@ class Source:
         """
         names = {column.column for column in given.values()}
         table = find_table(text, names if unclear is None else {*names, 1})
-        return cls(table, _assigned(table, given, unclear), given)
+        return cls(table, _assigned(table, given, unclear), given, section)
 
     def factor(self, channel: str) -> float:
         """Return the factor from the numbers of a channel to SI."""
@@ -54,9 +57,25 @@ class Source:
         """Return the measure of strain or stress that a header names, "" if engineering."""
         return self.table.headers[self.columns[channel]].measure(channel)
 
-    def entry(self, channel: str) -> Entry:
-        """Return the entry of [columns] for a channel, or an empty one if the TOML has none."""
-        return self.given.get(channel, Entry(channel))
+    @cached_property
+    def entries(self) -> dict[str, Entry]:
+        """The entries by which the channels are read: those of the TOML, completed."""
+        entries = dict[str, Entry]()
+        for channel, k in self.columns.items():
+            given = self.given.get(channel, Entry(channel))
+            over = _inverse(given, given.unit or self.table.headers[k].unit or "") is not None
+            column = column_of(self.table, k)
+            entries[channel] = replace(given, column=column, inverse=over, table=self.section)
+        return entries
+
+    def in_use(self) -> dict[str, Entry]:
+        """Return the entries by which stress, displacement, velocity, acceleration are read."""
+        own = {c: e for c, e in self.entries.items() if c in ("velocity", "acceleration")}
+        for name, channels in SOURCES.items():
+            if used := next((c for c in channels if c in self.entries), None):
+                own.pop(used, None)  # an acceleration read as a force is no channel of its own
+                own[name] = self.entries[used]
+        return own
 
     def only(self, channels: Iterable[str]) -> Source:
         """Return a source with these channels only."""
@@ -126,46 +145,18 @@ class Source:
                 found[twin] = min(ranks, key=ranks.__getitem__)
         return found
 
-    def scale_spreads(self) -> dict[str, float]:
-        """Return the relative standard deviations of the scales of the channels in use."""
-        used = self._used()
-        names = used | {c: c for c in ("velocity", "acceleration") if c in self.columns}
-        if used.get("stress") == "acceleration":  # then acceleration is not a separate channel
-            del names["acceleration"]
-        return {f"{n}_scale": spread for n, c in names.items() if (spread := self.entry(c).spread)}
-
-    def _used(self) -> dict[str, str]:
-        """Return the channels that stress and displacement are read from."""
-        present = {n: [c for c in cs if c in self.columns] for n, cs in SOURCES.items()}
-        return {name: channels[0] for name, channels in present.items() if channels}
-
-    def _over(self, channel: str) -> bool:
-        """Return whether the scale of a channel is a sensitivity."""
-        given = self.entry(channel)
-        unit = given.unit or self.table.headers[self.columns[channel]].unit or ""
-        return _inverse(given, unit) is not None
-
-    def _located(self, channel: str) -> Entry:
-        """Return the entry of a channel with its column."""
-        return replace(self.entry(channel), column=column_of(self.table, self.columns[channel]))
-
-    def entries(self, table: str) -> dict[str, Entry]:
-        """Return the entries of a table of the TOML by which stress and displacement are read."""
-        used = {name: (self._located(c), self._over(c)) for name, c in self._used().items()}
-        return {n: replace(one, inverse=over, table=table) for n, (one, over) in used.items()}
-
     def note(self) -> str:
         """Return a note with the column of each channel and the unused columns."""
         parts, table = [], self.table
-        for channel, k in self.columns.items():
-            given, header = self.entry(channel), table.headers[k]
-            unit = given.unit or header.unit or ""
-            by = f"{given.scale:.6g} {given.scale_unit}".strip()
-            by += f" ± {percent(given.spread)}" if given.spread else ""
-            how = "over the sensitivity" if self._over(channel) else "times"
-            part = f"{channel} from {table.name(k)}" + (f" in {given.unit}" if given.unit else "")
+        for channel, entry in self.entries.items():
+            by = f"{entry.scale:.6g} {entry.scale_unit}".strip()
+            by += f" ± {percent(entry.spread)}" if entry.spread else ""
+            how = "over the sensitivity" if entry.inverse else "times"
+            part = f"{channel} from {self.name(channel)}"
+            part += f" in {entry.unit}" if entry.unit else ""
             part += f" {how} {by}" if by != "1" else ""
-            part += ", counting down" if given.counts_down else ""
+            part += ", counting down" if entry.counts_down else ""
+            unit = entry.unit or table.headers[self.columns[channel]].unit or ""
             if channel == "force" and unit.casefold() in WEIGHTS:
                 part += f" ({WEIGHTS[unit.casefold()]}: the weight of that mass)"
             parts.append(part)
@@ -175,16 +166,16 @@ class Source:
 
     def sign_entry(self, channel: str) -> Entry:
         """Return the entry of the TOML that reverses the sign of a channel."""
-        given = self._located(channel)
+        entry = self.entries[channel]
         if channel.startswith("displacement"):
-            return replace(given, counts_down=True)
-        return replace(given, scale=-given.scale)
+            return replace(entry, counts_down=True)
+        return replace(entry, scale=-entry.scale)
 
     def stated_sign(self, channel: str) -> str:
         """Return what reverses the sign of a channel in the TOML; "" if nothing does."""
-        given = self.entry(channel)
-        minus = f"the minus sign of scale = {given.scale:g}" if given.scale < 0.0 else ""
-        return "counts_down = true" if given.counts_down else minus
+        entry = self.entries[channel]
+        minus = f"the minus sign of scale = {entry.scale:g}" if entry.scale < 0.0 else ""
+        return "counts_down = true" if entry.counts_down else minus
 
 
 def _assigned(
