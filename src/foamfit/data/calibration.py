@@ -19,8 +19,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import GRAVITY, INTEGRATED, Entry, Measurement, is_clipped
 from foamfit.data.noise import integrated_twice, residual_time, with_noise
-from foamfit.data.zeros import UNKNOWN_FALL
-from foamfit.text import engineering, rounded
+from foamfit.text import engineering, percent, rounded
 
 # Two numbers contradict each other if they differ by more than this many standard deviations. A
 # number without a ± has one of this share, so the limit is 3 % if no ± is stated.
@@ -28,6 +27,7 @@ BEYOND, UNSTATED = 3.0, 0.01
 # Standard deviation of the zero of the force, as a share of its peak, and of the delay between
 # force and motion, as a share of the time under load.
 ZERO, DELAY = 0.01, 0.1
+MATTERS = 0.01  # relative gain of velocity in a fall above which gravity must be known
 AGREES = 2.0  # standard errors within which an acceleration is that of gravity, or none
 TENTH = 0.1  # of the limit: to this share a number in a line of the TOML is rounded
 LATE = 4.0  # standard errors of a delay beyond which the clocks of force and motion disagree
@@ -165,33 +165,34 @@ def balance(test: Measurement) -> Balance:
     velocity, derived = fitted.velocity if begins and not integrated else None, test.derived
     if "stress" in derived:
         return Balance(velocity, None)
-    plain = fitted if velocity is not None else Balance(None, fitted.force)
-    damped = _fitted(*given, damped=True)
-    if damped is None or damped.damping is None or contradictions(test, damped):
-        return plain
-    (size, error), closer = damped.damping, damped.scatter <= 0.5 * fitted.scatter
-    if size <= BEYOND * error or not (closer or contradictions(test, fitted)):
-        return plain
-    return damped if velocity is not None else Balance(None, damped.force, None, damped.damping)
+    found, damped = fitted, _fitted(*given, damped=True)
+    if damped is not None and damped.damping is not None and not contradictions(test, damped):
+        (size, error), closer = damped.damping, damped.scatter <= 0.5 * fitted.scatter
+        if size > BEYOND * error and (closer or contradictions(test, fitted)):
+            found = damped
+    return found if velocity is not None else Balance(force=found.force, damping=found.damping)
 
 
 def with_gravity(test: Measurement) -> Measurement:
     """Decide by force and motion whether the striker falls, if neither TOML nor flight says it."""
-    striker, asked = test.striker, [note for note in test.notes if UNKNOWN_FALL in note]
-    if not asked or striker is None or striker.gravity is not None:
+    striker, time = test.striker, test.time
+    if striker is None or time is None or striker.gravity is not None or not striker.velocity:
+        return test
+    if (share := GRAVITY * float(time[-1]) / striker.velocity) <= MATTERS:
         return test
     shown = balance(test)
-    if shown.gravity is None or contradictions(test, shown):
-        return test
-    value, error = shown.gravity
+    value, error = shown.gravity or (0.0, math.inf)
     falls, flies = (abs(value - one) <= AGREES * error for one in (GRAVITY, 0.0))
-    if falls == flies or 2.0 * AGREES * error > GRAVITY:
-        return test
-    does, taken = ("falls", GRAVITY) if falls else ("does not fall", 0.0)
-    note = f"Force and motion show that the striker {does}: gravity accelerates it by "
-    note += f"{value:.2g} ± {error:.1g} m/s². The fit takes {taken:g} m/s²."
-    notes = tuple(note if one in asked else one for one in test.notes)
-    return replace(test, striker=replace(striker, gravity=taken), notes=notes)
+    if falls != flies and 2.0 * AGREES * error <= GRAVITY and not contradictions(test, shown):
+        does, taken = ("falls", GRAVITY) if falls else ("does not fall", 0.0)
+        note = f"Force and motion show that the striker {does}: gravity accelerates it by "
+        note += f"{value:.2g} ± {error:.1g} m/s². The fit takes {taken:g} m/s²."
+        striker = replace(striker, gravity=taken)
+    else:
+        note = f"Check: a falling striker gains {percent(share)} of its velocity over the contact, "
+        note += "but the record does not show whether this one falls; write gravity = true or "
+        note += "false under [striker]."
+    return replace(test, striker=striker, notes=(*test.notes, note))
 
 
 def _fitted(

@@ -25,7 +25,6 @@ _ERRORS = 2.0  # standard errors added to the slope at rest
 # motion starts at zero (a rising stress is then contact); and if it starts away from zero, unless
 # there is no other rest.
 _DRIFT, _DRIFT_AT_ZERO, _DRIFT_AWAY = 0.01, 0.002, 0.06
-_TOUCHING = 0.03  # largest stress at a contact where the motion passes zero, as a share of the peak
 _APPROACH = 0.02  # share of its travel beyond which a machine without load is not in contact
 _AGAIN = 0.1  # share of the peak above which a stress shows a contact
 _BRAKED = 0.02  # share of the peak of a derived stress at which contact starts
@@ -71,6 +70,17 @@ class Start:
         return max(0, self.first - 2) if self.free else 0
 
 
+def misfits_of_rises(x: Array, y: Array, starts: Array, *, centred: bool) -> Array:
+    """Return the squares that remain of y about the best straight rise from each start.
+
+    Before the start, y is zero, or at any level if it is `centred`.
+    """
+    rises = np.maximum(0.0, x - starts[:, None])
+    rises -= rises.mean(axis=1, keepdims=True) if centred else 0.0
+    size = np.maximum(np.sum(rises**2, axis=1), 1e-300)
+    return np.asarray(y @ y - np.maximum(rises @ y, 0.0) ** 2 / size)
+
+
 def _kink(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
     """Find the time from which a signal rises linearly; None if it rises from the first sample.
 
@@ -82,18 +92,11 @@ def _kink(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
         return None
     t, y = (x[-rows * block :].reshape(rows, block).mean(axis=1) for x in (time, values))
     y = y - y.mean()
-
-    def misfit(starts: Array) -> Array:
-        ramps = np.maximum(0.0, (t - starts[:, None]) / (t[-1] - t[0]))
-        ramps -= ramps.mean(axis=1, keepdims=True)
-        size = np.maximum(np.sum(ramps**2, axis=1), 1e-300)
-        return np.asarray(y @ y - np.maximum(ramps @ y, 0.0) ** 2 / size)
-
     coarse = np.linspace(t[0], t[-2], 200)
-    misfits = misfit(coarse)
+    misfits = misfits_of_rises(t, y, coarse, centred=True)
     at = int(np.argmin(misfits))
     fine = np.linspace(coarse[max(at - 2, 0)], coarse[min(at + 2, 199)], 41)
-    near = misfit(fine)
+    near = misfits_of_rises(t, y, fine, centred=True)
     best = float(near.min())
     white = noise.sigma**2 * min(noise.time / block, 1.0)
     variance = max(best / rows, 0.25 * white) * max(noise.time / block, 1.0)
@@ -290,11 +293,6 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
         if start and later and _has_risen(time, stress, start.first, at[0], levels["stress"]):
             return replace(start, gauge="rest")
         return replace(_at_kink("displacement", time, at, "motion"), gauge="rest")
-    crossing = int(np.argmax(w >= 0.0))
-    load = float(stress[crossing] - np.median(stress[: crossing // 4 + 1]))
-    if elsewhere and first < 0.0 < w[top] and load < _TOUCHING * peak:
-        how = "where the displacement passes zero"
-        return Start(how, float(time[crossing]), crossing, by="motion", gauge="other")
     return _at_first(time)
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from foamfit.arrays import Array, Integers
+from foamfit.data.contact import misfits_of_rises
 from foamfit.data.measurement import Measurement, Record
 from foamfit.data.noise import TENSION, lowest_mean, noise_level, smooth
 from foamfit.errors import InputError
@@ -169,7 +170,8 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     rise = float(mean[top]) - free
     early = cycle.first + int(np.argmax(mean[cycle.first : top + 1] >= free + _EARLY * rise))
     part = slice(cycle.first, max(early, cycle.first + _FEWEST) + 1)
-    contact = (_crossing if glued else _hinge)(w[part], stress[part] - free)
+    above = stress[part] - free
+    contact = _hinge(w[part], np.maximum(above, 0.0) if glued else above)
     last = min(part.start + int(np.flatnonzero(w[part] <= contact)[-1]), top - 1)
     ahead = float(w[last + 1] - w[last])
     share = (contact - float(w[last])) / ahead if ahead > 0.0 else 0.0
@@ -182,14 +184,12 @@ def cut_to_reload(record: Record, cycles: list[Cycle], cycle: Cycle, height: flo
     first, end = last + (share > 0.0), turn + int(back[0]) + 1 if back.size else cycle.end
     time = at_contact(record.instants)
     moment = "" if record.time is None else f" {engineering(time, 's')} in the file,"
-    rises, returns = "from its level between the cycles", "to that level"
-    if glued:
-        rises, returns = "from tension through zero", "to zero (taken as glued)"
+    level_of = "zero (taken as glued)" if glued else "its level between the cycles"
     notes = [
-        f"Contact of cycle {number} starts{moment} where the stress rises {rises}, at a strain of "
-        f"{percent(contact / height)} from the first contact (start strain, not recovered), which "
-        f"is taken off; {first - cycle.first} samples before and {cycle.end - end} after, where "
-        f"the stress has gone back {returns}, are cut."
+        f"Contact of cycle {number} starts{moment} where the stress rises above {level_of}, at a "
+        f"strain of {percent(contact / height)} from the first contact (start strain, not "
+        f"recovered), which is taken off; {first - cycle.first} samples before and "
+        f"{cycle.end - end} after contact are cut."
     ]
     loaded = (level - offset) / (float(stress[top]) - offset)
     if offset < 0.0:
@@ -254,22 +254,12 @@ def _is_glued(record: Record, level: float, peak: float) -> bool:
     return level < -max(TENSION * peak, _SURE * error)
 
 
-def _crossing(w: Array, stress: Array) -> float:
-    """Return the displacement at which a stress rises through zero, from a line around it."""
-    near = np.abs(stress) <= float(stress[-1])
-    slope, level = np.polyfit(w[near], stress[near], 1)
-    return float(np.clip(-level / slope, w.min(), w.max()))
-
-
 def _hinge(w: Array, stress: Array) -> float:
     """Return the displacement up to which a stress is zero and from which it rises linearly."""
     every = slice(None, None, 1 + w.size // 1000)
     w, stress = w[every], stress[every]
     places = np.linspace(float(w.min()), float(w.max()), _PLACES, endpoint=False)
-    beyond = np.maximum(w - places[:, None], 0.0)
-    slopes = beyond @ stress / np.maximum(np.sum(beyond**2, axis=1), 1e-300)
-    left = np.sum((stress - slopes[:, None] * beyond) ** 2, axis=1)
-    return float(places[int(np.argmin(left))])
+    return float(places[int(np.argmin(misfits_of_rises(w, stress, places, centred=False)))])
 
 
 def find_turns(values: Array, back: float | None = None) -> Integers:

@@ -37,13 +37,13 @@ class Frames:
 
     def __str__(self) -> str:
         """Return a sentence with the number of frames, their clock, and the delay."""
-        step, first, last = float(np.median(np.diff(self.time))), self.time[0], self.time[-1]
+        clock = float(np.median(np.diff(self.time))), *self.time[[0, -1]].tolist(), self.delay
+        step, first, last, delay = (engineering(t, "s") for t in clock)
         sigma = "exactly" if self.spread is None else f"± {engineering(self.spread, 's')}"
         return (
-            f"The motion is that of {self.name}: {self.time.size} frames, every "
-            f"{engineering(step, 's')} from {engineering(float(first), 's')} to "
-            f"{engineering(float(last), 's')} by its own clock; time of the force = time of the "
-            f"motion + delay, and the delay is {engineering(self.delay, 's')} {sigma}."
+            f"The motion is that of {self.name}: {self.time.size} frames, every {step} from "
+            f"{first} to {last} by its own clock; time of the force = time of the motion + delay, "
+            f"and the delay is {delay} {sigma}."
         )
 
 

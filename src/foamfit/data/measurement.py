@@ -207,6 +207,13 @@ class Samples:
     notes: tuple[str, ...] = ()
     before: tuple[Array, Array] | None = None  #: times (s) and motion (m) before a later cycle
 
+    @property
+    def instants(self) -> Array:
+        """Time, or sample numbers without a time, shape (n,)."""
+        time: Array | None = vars(self)["time"]
+        n = next(iter(self.curves("acceleration").values())).size
+        return np.arange(n, dtype=np.float64) if time is None else time
+
     def curves(self, *more: str) -> dict[str, Array]:
         """Return the available ones of stress, displacement, `more`, interior displacements."""
         names = ("stress", "displacement", *more)
@@ -246,11 +253,6 @@ class Record(Samples):
     def row_numbers(self) -> Integers:
         """Row number in the file of each sample, shape (n,)."""
         return np.arange(1, len(self) + 1) if self.numbers is None else self.numbers
-
-    @property
-    def instants(self) -> Array:
-        """Time, or sample numbers without a time, shape (n,)."""
-        return np.arange(len(self), dtype=np.float64) if self.time is None else self.time
 
     @property
     def stood_still(self) -> Mask:
@@ -377,12 +379,6 @@ class Measurement(Samples):
     def channels(self) -> dict[str, Array]:
         """Return the available ones of stress, displacement, acceleration, interior motions."""
         return self.curves("acceleration")
-
-    @property
-    def instants(self) -> Array:
-        """Time, or sample numbers without a time, shape (n,)."""
-        n = next(iter(self.channels().values())).size
-        return np.arange(n, dtype=np.float64) if self.time is None else self.time
 
 
 def is_velocity(test: Record | Measurement) -> bool:

@@ -29,21 +29,6 @@ from foamfit.text import engineering, listed
 Range = tuple[float, float]
 
 
-@dataclass(frozen=True)
-class Strain:
-    """Check of a strain, or of a range of strains, between 0 and 1."""
-
-    positive: toml.Quantity
-
-    def __call__(self, value: Any, where: str) -> Any:
-        """Return the strain, or the ends of the range."""
-        found = self.positive(value, where)
-        if np.max(found) >= 1.0:
-            example = self.positive.example
-            raise InputError(f'{where} = "{value}" must be between 0 and 1, like "{example}".')
-        return found
-
-
 _RIG: dict[str, dict[str, toml.Check]] = {
     "striker": {
         "velocity": toml.Span("m/s", "0.5 to 6 m/s"),
@@ -51,14 +36,14 @@ _RIG: dict[str, dict[str, toml.Check]] = {
     },
     "machine": {
         "rate": toml.Span("1/s", "0.01 to 10 1/s"),
-        "strain": Strain(toml.Span("", "0.1 to 0.7")),
+        "strain": toml.Span("", "0.1 to 0.7", below=1.0),
         "cycles": toml.COUNT,
         "hold": toml.Quantity("s", "10 s"),
     },
     "limits": {
         "force": toml.Quantity("N", "500 N"),
         "displacement": toml.Quantity("m", "1 mm"),
-        "strain": Strain(toml.Quantity("", "0.9")),
+        "strain": toml.Quantity("", "0.9", below=1.0),
     },
     "record": {
         "rate": toml.Quantity("1/s", "1 MHz"),
@@ -66,6 +51,9 @@ _RIG: dict[str, dict[str, toml.Check]] = {
         "interior": toml.FLAG,
     },
 }
+# Fields of `Rig` with other names than their keys
+_FIELDS = {("machine", "rate"): "rates", ("limits", "strain"): "largest_strain"}
+_FIELDS |= {("record", "rate"): "sampling"}
 VELOCITIES, STRAINS, RATES = 24, 5, 5  # numbers of candidates over each range
 LOCK_UP = 0.95  # largest strain, if no limit is stated
 # Ranges, relative to the record, that a rig is assumed to have if it states none.
@@ -84,19 +72,19 @@ class Rig:
     Without a striker `masses` is empty, and without a testing machine `rates` is (0, 0).
     """
 
-    velocity: Range
-    masses: tuple[float, ...]
-    strain: Range
-    rates: Range
-    cycles: int
-    hold: float
-    force: float  #: largest force, N
-    displacement: float  #: largest displacement, m
-    largest_strain: float
-    sampling: float | None  #: samples per second; None: as many per cycle as in the record
     noise: dict[str, float]
+    cycles: int
     interior: bool
-    notes: tuple[str, ...] = ()  #: what was taken from the record
+    notes: tuple[str, ...]  #: what was taken from the record
+    velocity: Range = (0.0, 0.0)
+    masses: tuple[float, ...] = ()
+    strain: Range = (0.0, 0.0)
+    rates: Range = (0.0, 0.0)
+    hold: float = 0.0
+    force: float = math.inf  #: largest force, N
+    displacement: float = math.inf  #: largest displacement, m
+    largest_strain: float = LOCK_UP
+    sampling: float | None = None  #: samples per second; None: as many per cycle as in the record
 
     @property
     def limits(self) -> str:
@@ -259,7 +247,7 @@ def read_rig(path: Path | None, test: Measurement, *, relaxing: bool = False) ->
 
 def _completed(stated: dict[str, dict[str, Any]], test: Measurement, relaxing: bool) -> Rig:
     test, notes = with_noise(test), list[str]()
-    hits, machine, limits, record = (stated[name] for name in _RIG)
+    hits, machine, _, record = (stated[name] for name in _RIG)
 
     def assume(table: dict[str, Any], key: str, value: Any, said: str) -> None:
         if key not in table:
@@ -289,20 +277,16 @@ def _completed(stated: dict[str, dict[str, Any]], test: Measurement, relaxing: b
     if "masses" in hits and test.time is not None:
         rate = 1.0 / float(np.median(np.diff(test.time)))
         assume(record, "rate", rate, f"{engineering(rate, 'Hz')} sampling")
-    noise, small = record.get("noise", {}), 1e-3 * test.specimen.height
+    noise, small = record.setdefault("noise", {}), 1e-3 * test.specimen.height
     usual = {"stress": small if test.stress is None else 0.01 * float(np.ptp(test.stress))}
     for channel, unit in (("stress", "Pa"), ("displacement", "m")):
         level = test.noise.of(channel)
         sigma = level.sigma if level and level.sigma else usual.get(channel, small)
         assume(noise, channel, sigma, f"noise of {engineering(sigma, unit)} ({channel})")
-    return Rig(
-        velocity=hits.get("velocity", (0.0, 0.0)), masses=hits.get("masses", ()),
-        strain=machine.get("strain", (0.0, 0.0)), rates=machine.get("rate", (0.0, 0.0)),
-        cycles=machine.get("cycles", max(len(test.cycles), 1)), hold=machine.get("hold", 0.0),
-        force=limits.get("force", math.inf), displacement=limits.get("displacement", math.inf),
-        largest_strain=limits.get("strain", LOCK_UP), sampling=record.get("rate"), noise=noise,
-        interior=record.get("interior", bool(test.interior)), notes=tuple(notes),
-    )  # fmt: skip
+    own: dict[str, Any] = {"cycles": max(len(test.cycles), 1), "interior": bool(test.interior)}
+    for name, table in stated.items():
+        own |= {_FIELDS.get((name, key), key): value for key, value in table.items()}
+    return Rig(**own, notes=tuple(notes))
 
 
 def beyond(rig: Rig, springs: int) -> Iterator[tuple[str, Rig]]:

@@ -1,13 +1,4 @@
-"""Read and check the TOML of a test and convert its quantities to SI.
-
-[columns] describes a channel that is not clear from its header: ``column`` (header or number),
-``unit``, ``scale`` (a number, or a quantity such as "4444.4 N/V"; a negative one changes the sign)
-and, for displacements, ``counts_down = true`` (a gap or a position that decreases in compression).
-[data] ``duplicates`` is "average" (consecutive rows with the same time stamp become one sample) or
-"refuse", ``sheet`` the name of a sheet in a workbook. A quantity may have a standard deviation,
-"1.75 ± 0.01 m/s"; see `Measurement.uncertainties`. [motion] names a ``file``, relative to the TOML,
-with its own clock, the ``delay`` of that clock, and in [motion.columns] its columns. [priors]
-contains prior knowledge of parameters, "5.5 ± 0.1 MPa".
+"""Read and check the TOML of a test and convert its quantities to SI; its keys: docs/files.md.
 
 A table of keys maps each key to its check: a function of the value and of its place in the file,
 for messages, that returns the value to use or raises InputError.
@@ -60,12 +51,13 @@ class Stated(NamedTuple):
 
 @dataclass(frozen=True)
 class Quantity:
-    """Check of a quantity: its SI unit, an example, and whether it may have a ± (`Stated`)."""
+    """Check of a quantity: its SI unit, an example, limits, and whether it may have a ±."""
 
     si: str
     example: str
     positive: bool = True
     uncertain: bool = False
+    below: float = math.inf
 
     def __call__(self, value: Any, where: str) -> Any:
         """Return the quantity in SI."""
@@ -74,9 +66,14 @@ class Quantity:
             number, sigma = units.parse_uncertain(*given, zero=not self.positive)
         else:
             number = units.parse_quantity(*given)
-        if self.positive and number <= 0.0:
-            raise InputError(f'{where} = "{value}" must be positive, like "{self.example}".')
+        self.check_limits(number, value, where)
         return Stated(number, sigma) if self.uncertain else number
+
+    def check_limits(self, number: float, value: Any, where: str) -> None:
+        """Raise InputError for a number that is not positive, or too large."""
+        if (self.positive and number <= 0.0) or number >= self.below:
+            wanted = "positive" if self.below == math.inf else f"between 0 and {self.below:g}"
+            raise InputError(f'{where} = "{value}" must be {wanted}, like "{self.example}".')
 
 
 class Span(Quantity):
@@ -92,6 +89,7 @@ class Span(Quantity):
         if len(found) > 2 or found[0] <= 0.0 or found != sorted(found):
             wanted = f'a range of positive values, like "{self.example}"'
             raise InputError(f'{where} = "{value}" must be {wanted}.')
+        self.check_limits(found[-1], value, where)
         return found[0], found[-1]
 
 

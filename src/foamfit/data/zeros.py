@@ -35,9 +35,6 @@ _TAIL = 0.04  # share of a record taken as its end
 _FLAT = 3.5  # most slope of a flat end, in standard errors
 _HIGHEST = 0.1  # highest level of the end, as a share of the range
 _DRIFTS = 0.005  # share of its range by which a stress that drifts changes at least
-_MATTERS = 0.01  # relative gain of velocity in a fall above which gravity must be specified
-# Part of a note if nothing says whether the striker falls; `with_gravity` searches for it.
-UNKNOWN_FALL = "does not show whether this one falls"
 # Parts of notes that others search for: motion and given velocity are inconsistent; what relaxed
 # before the first row is unknown.
 UNDER_LOAD = "the record starts under load"
@@ -119,39 +116,34 @@ def take_zeros(
     for name, values in first.curves("acceleration").items():
         if name in record.derived:
             continue
-        noise, zero, note = levels[name], NOTHING, ""
-        if name in ("stress", "acceleration"):
-            unit = UNITS[name]
-            tail = tail_level(values, noise) if impact and n < _FEW else None
-            if tail is not None and tail.samples > n:
-                zero, left = tail, f"the striker has left in the last {tail.samples} rows"
-                note = f"The {name} at the end of the record, {engineering(zero.value, unit)}, is "
-                note += f"taken off as the sensor's offset ({left})."
-            elif n >= _FEWEST:
-                zero, note = _zero_at_rest(name, values[:n], unit, np.ptp(values), noise)
-            elif start.first:
-                kept = f"the zero of the {name} in the file is kept"
-                note = f"Only {n} rows are certainly before contact: {kept}."
-            if zero.samples:
-                steps = _of_steps(values, values[:n])
-                errors[name] = float(np.hypot(zero.error, steps))
-                if impact and steps > zero.error:  # rows on one level do not show the zero again
-                    away = np.ones(len(record), dtype=bool)
-                    away[start.first : span.leaves] = False
-                    seen = record.sampled.get(name, ~away)
-                    record = replace(record, sampled=record.sampled | {name: seen & ~away})
+        noise, size, unit = levels[name], float(np.ptp(values)), UNITS.get(name, "m")
+        if sensor := name in ("stress", "acceleration"):
+            zero, how = _zero_of_sensor(values, n, noise, unit, impact=impact)
+            known, least = zero.samples > 0, -1.0
+            steps = _of_steps(values, values[:n]) if known else 0.0
+            if impact and steps > zero.error:  # rows on one level do not show the zero again
+                away = np.ones(len(record), dtype=bool)
+                away[start.first : span.leaves] = False
+                seen = record.sampled.get(name, ~away)
+                record = replace(record, sampled=record.sampled | {name: seen & ~away})
+            zero = zero._replace(error=float(np.hypot(zero.error, steps)))
         else:
-            zero, source = _zero_of_motion(name, first, start, n, noise, impact=impact)
+            zero, how = _zero_of_motion(name, first, start, n, noise, impact=impact)
             top = name == "displacement"
-            if n >= _FEWEST and (not top or start.gauge == "rest"):
-                errors[name] = zero.error
-            if abs(zero.value) > (0.0 if top else 1e-3 * np.ptp(values)):
-                label, size = "The displacement" if top else name, engineering(zero.value, "m")
-                note = f"{label} at contact, {size}, is taken off ({source})."
-        tared = not impact and start.by == "file" and not zero.samples and values[0] == 0.0
-        if tared and noise.sigma > EXACT * np.ptp(values):
-            errors[name] = noise.sigma  # that of the first row, which was set to zero
-        record = record.shifted(name, zero.value).noted(*[note] * bool(note))
+            known, least = n >= _FEWEST and not (top and start.gauge != "rest"), 1e-3 * (not top)
+        if known:
+            errors[name] = zero.error
+        elif not impact and not zero.samples and start.by == "file" and values[0] == 0.0:
+            # The first row, which was set to zero, has an error unless the channel is exact.
+            errors |= {name: noise.sigma} if noise.sigma > EXACT * size else {}
+        if zero.samples and abs(zero.value) > least * size:
+            value = engineering(zero.value, unit)
+            value += f" ± {engineering(zero.error, unit)}" if sensor else ""
+            record = record.noted(f"The {name} at contact, {value}, is taken off ({how}).")
+        elif sensor and start.first:
+            kept = f"the zero of the {name} in the file is kept"
+            record = record.noted(f"Only {n} rows are certainly before contact: {kept}.")
+        record = record.shifted(name, zero.value)
     return replace(record, zeros=errors)
 
 
@@ -190,24 +182,23 @@ def without_drift(record: Record, start: Start, levels: Levels) -> Record:
     return record.noted(note).changed("stress", stress - slope.value * (time - start.time))
 
 
-def _zero_at_rest(
-    name: str, rest: Array, unit: str, size: float, noise: NoiseLevel
+def _zero_of_sensor(
+    values: Array, n: int, noise: NoiseLevel, unit: str, *, impact: bool
 ) -> tuple[Level, str]:
-    """Return the zero of a stress or acceleration at rest; 0 if its drift is larger."""
-    n, zero, note = len(rest), mean_level(rest, noise), ""
-    slope = polynomial_at(np.arange(n, dtype=np.float64), rest, 0.0, noise)[1]
+    """Return the zero of a stress or acceleration from `n` rows at rest, or from the flat end."""
+    tail = tail_level(values, noise) if impact and n < _FEW else None
+    if tail is not None and tail.samples > n:
+        return tail, f"mean of the last {tail.samples} rows, after the striker has left"
+    if n < _FEWEST:
+        return NOTHING, ""
+    zero, how = mean_level(values[:n], noise), f"mean of {n} samples at rest before contact"
+    slope = polynomial_at(np.arange(n, dtype=np.float64), values[:n], 0.0, noise)[1]
     rise = slope.value * n
-    if abs(rise) > max(0.01 * size, 4 * slope.error * n):
-        kept = abs(zero.value) <= abs(rise)
-        done = "no offset is taken off" if kept else "its zero is as uncertain"
-        note = f"The {name} drifts by {engineering(rise, unit)} in the {n} samples before contact, "
-        note += f"so {done}. "
-        zero = Level(0.0 if kept else zero.value, float(np.hypot(zero.error, rise)), n)
-    if zero.value:
-        value, error = (engineering(v, unit) for v in (zero.value, zero.error))
-        note += f"The {name} before contact, {value} ± {error}, is taken off as the sensor's "
-        note += f"offset (mean of {n} samples at rest)."
-    return zero, note.strip()
+    if abs(rise) > max(0.01 * float(np.ptp(values)), 4 * slope.error * n):
+        kept = zero.value if abs(zero.value) > abs(rise) else 0.0
+        zero = Level(kept, float(np.hypot(zero.error, rise)), n)
+        how += f", in which it drifts by {engineering(rise, unit)}"
+    return zero, how
 
 
 def _zero_of_motion(
@@ -288,37 +279,31 @@ def flight_of(
     flight with its standard error, m/s, or None, and notes.
     """
     n, w, given, notes = start.first - 2, record.displacement, striker.velocity, list[str]()
-    if not given:
+    if not given or w is None or n < 8:
         return striker, None, notes
-    flight = None
-    gain = percent(share := GRAVITY * float(record.instants[span.end - 1] - start.time) / given)
-    if w is not None and n >= 8:
-        noise, t = levels["displacement"], record.instants[:n] - start.time
-        gravity, error = (2.0 * half for half in polynomial_at(t, w[:n], 0.0, noise, 2)[2][:2])
-        none = start.gauge == "flight" and 4.0 * error < GRAVITY
-        if falls := gravity > 4.0 * error and abs(gravity - GRAVITY) < 0.2 * GRAVITY + 2.0 * error:
-            starts, ends = "Before", ". The fit includes gravity."
-            if striker.gravity == 0.0:
-                starts, ends = "Check: before", ", but [striker] gravity is false."
-            notes.append(
-                f"{starts} contact the striker accelerates by {engineering(gravity, 'm/s²')}: it "
-                f"falls, and gains {gain} of its velocity over the contact{ends}"
-            )
-        if striker.gravity is None and (falls or none):
-            striker = replace(striker, gravity=GRAVITY if falls else 0.0)
-        fall = 0.5 * (striker.gravity or 0.0) * t**2
-        speed, error = polynomial_at(t, w[:n] - fall, 0.0, noise)[1][:2]
-        if striker.gravity is None:  # the line has the mean velocity of a fall
-            error = float(np.hypot(error, 0.5 * GRAVITY * np.ptp(t)))
-        flight = (float(speed), float(error)) if speed > 0.5 * given else None
-        deviation, error = abs(speed - given), float(np.hypot(error, spread))
-        if deviation > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:
-            moves = f"the displacement moves at {speed:.4g} ± {error:.2g} m/s"
-            notes.append(f"Check: before contact {moves}, {CONTRADICTED} {given:.4g} m/s.")
-    if striker.gravity is None and share > _MATTERS:
-        remedy = "write gravity = true or false under [striker]"
-        gains = f"a falling striker gains {gain} of its velocity over the contact"
-        notes.append(f"Check: {gains}, but the record {UNKNOWN_FALL}; {remedy}.")
+    noise, t = levels["displacement"], record.instants[:n] - start.time
+    gravity, error = (2.0 * half for half in polynomial_at(t, w[:n], 0.0, noise, 2)[2][:2])
+    none = start.gauge == "flight" and 4.0 * error < GRAVITY
+    if falls := gravity > 4.0 * error and abs(gravity - GRAVITY) < 0.2 * GRAVITY + 2.0 * error:
+        gain = percent(GRAVITY * float(record.instants[span.end - 1] - start.time) / given)
+        starts, ends = "Before", ". The fit includes gravity."
+        if striker.gravity == 0.0:
+            starts, ends = "Check: before", ", but [striker] gravity is false."
+        notes.append(
+            f"{starts} contact the striker accelerates by {engineering(gravity, 'm/s²')}: it "
+            f"falls, and gains {gain} of its velocity over the contact{ends}"
+        )
+    if striker.gravity is None and (falls or none):
+        striker = replace(striker, gravity=GRAVITY if falls else 0.0)
+    fall = 0.5 * (striker.gravity or 0.0) * t**2
+    speed, error = polynomial_at(t, w[:n] - fall, 0.0, noise)[1][:2]
+    if striker.gravity is None:  # the line has the mean velocity of a fall
+        error = float(np.hypot(error, 0.5 * GRAVITY * np.ptp(t)))
+    flight = (speed, error) if speed > 0.5 * given else None
+    deviation, error = abs(speed - given), float(np.hypot(error, spread))
+    if deviation > max(3.0 * error, 0.005 * given) and abs(speed) > 0.5 * given:
+        moves = f"the displacement moves at {speed:.4g} ± {error:.2g} m/s"
+        notes.append(f"Check: before contact {moves}, {CONTRADICTED} {given:.4g} m/s.")
     return striker, flight, notes
 
 

@@ -13,7 +13,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
@@ -242,50 +241,43 @@ def _signs(force: Array, motion: Array) -> tuple[int, int] | None:
     Consistent channels remain as they are unless they are negative on one side only.
     """
     ends = np.unique([0, *find_turns(motion), motion.size - 1]).tolist()
-    runs = [_Run.of(force[i : j + 1], motion[i : j + 1]) for i, j in pairwise(ends)]
-    most = max((abs(run.work) for run in runs), default=0.0)
-    if most == 0.0:
+    runs = [_judged(force[i : j + 1], motion[i : j + 1]) for i, j in pairwise(ends)]
+    zeros, ways, works = np.array(runs).reshape(-1, 3).T
+    size = np.abs(works)
+    if size.max(initial=0.0) == 0.0:
         return 1, 1
-    at, run = next((i, run) for i, run in enumerate(runs) if abs(run.work) >= _FIRST * most)
-    same, towards = (1 if run.work > 0.0 else -1), run.towards
+    at = int(np.argmax(size >= _FIRST * size.max()))
+    same, towards = (1 if works[at] > 0.0 else -1), int(ways[at])
     sign = same * towards
     if sign > 0 and towards > 0:
         return 1, 1
-    zero = min(sign * earlier.zero for earlier in runs[: at + 1])  # unloaded
+    zero = float(np.min(sign * zeros[: at + 1]))  # unloaded
     load, steps = sign * force - zero, np.abs(np.diff(motion, append=motion[-1]))
     work = float(np.dot(steps, np.maximum(load, 0.0)))
     # A mean weighted by the load itself does not depend on motion without load.
     mean = float(np.dot(steps, np.maximum(load, 0.0) ** 2)) / work if work else 0.0
     under, against = (float(steps[s * load > _LOADED * mean].sum()) for s in (1, -1))
-    agree = same * sum(run.work for run in runs) >= _AGREE * sum(abs(run.work) for run in runs)
+    agree = same * works.sum() >= _AGREE * size.sum()
     if against < _ONE_SIDED * under and agree and zero + mean > 0.0:
         return sign, towards
     return (1, 1) if same > 0 else None
 
 
-class _Run(NamedTuple):
-    """A part of the record in which the motion does not turn.
+def _judged(force: Array, motion: Array) -> tuple[float, float, float]:
+    """Judge a run: it is a loading unless the force falls from its peak to zero.
 
-    `zero` is the force of the unloaded specimen, `towards` the direction of the motion in
-    compression, and the work is positive if force and motion have the same one.
+    Return the force of the unloaded specimen, the direction of the motion in compression, and the
+    work, positive if force and motion have the same direction.
     """
-
-    zero: float
-    towards: int
-    work: float
-
-    @classmethod
-    def of(cls, force: Array, motion: Array) -> _Run:
-        """Judge a run: it is a loading unless the force falls from its peak to zero."""
-        ends = slice(_FEW), slice(-1, -_FEW - 1, -1)
-        near = (np.abs(motion[e] - motion[e][0]) <= _NEAR * np.ptp(motion) for e in ends)
-        start, end = (float(np.median(force[e][n])) for e, n in zip(ends, near, strict=True))
-        way = int(np.sign(motion[-1] - motion[0]))
-        work, other = (float(np.trapezoid(force - zero, motion)) for zero in (start, end))
-        falls = abs(end) < _UNLOADED * abs(start) and abs(start) > 0.5 * float(np.abs(force).max())
-        # A long way without load does no work from the level at that end.
-        least = min(abs(work), abs(other))
-        return cls(*((end, -way) if falls else (start, way)), math.copysign(least, work))
+    ends = slice(_FEW), slice(-1, -_FEW - 1, -1)
+    near = (np.abs(motion[e] - motion[e][0]) <= _NEAR * np.ptp(motion) for e in ends)
+    start, end = (float(np.median(force[e][n])) for e, n in zip(ends, near, strict=True))
+    way = float(np.sign(motion[-1] - motion[0]))
+    work, other = (float(np.trapezoid(force - zero, motion)) for zero in (start, end))
+    falls = abs(end) < _UNLOADED * abs(start) and abs(start) > 0.5 * float(np.abs(force).max())
+    # A long way without load does no work from the level at that end.
+    work = math.copysign(min(abs(work), abs(other)), work)
+    return (end, -way, work) if falls else (start, way, work)
 
 
 def _pulse_is_negative(force: Array) -> bool:

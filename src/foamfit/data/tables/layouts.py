@@ -9,7 +9,6 @@ import re
 import warnings
 import zlib
 from statistics import mode
-from typing import NamedTuple
 
 from foamfit.data.measurement import MIN_ROWS
 from foamfit.errors import InputError
@@ -30,15 +29,9 @@ _NAME = re.compile(r"[^\s(\[]+(?:\s?[(\[][^)\]]*[)\]])?")  # a word, with its un
 _NUMBERS = re.compile(r"\s*(?:[+-]?[\d.,]*\d[.,]?(?:e[+-]?\d+)?(?:\s+|$)){2,}", re.I | re.A)
 
 
-class Scope(NamedTuple):
-    """Headers and number of rows in the preamble of an oscilloscope file.
-
-    `clock` is start and step, s, if the first column contains sample numbers.
-    """
-
-    headers: list[str]
-    rows: int
-    clock: tuple[float, float] | None = None
+# Headers and number of rows in the preamble of an oscilloscope file, and start and step of its
+# clock, s, if the first column contains sample numbers.
+Scope = tuple[list[str], int, tuple[float, float] | None]
 
 
 def unpacked(raw: bytes, sheet: str | None) -> bytes:
@@ -96,18 +89,18 @@ def scope_of(grid: list[list[str]]) -> Scope | None:
     first, second = (*rows, [], [])[:2]
     words = [cell.casefold() for cell in first]
     if len(second) > 1 and words[0] == "x-axis":
-        return Scope(_with_units(["Time", *first[1:]], second), 2)
+        return _with_units(["Time", *first[1:]], second), 2, None
     preamble = dict(zip(words, second, strict=False))
     numbers = [preamble.get(name, "") for name in ("start", "increment")]
     if words[:1] == ["x"] and len(second) == len(first) and all(map(_NUMBER.fullmatch, numbers)):
         start, step = map(float, numbers)
         units = ["s", *second[1 : words.index("start")]]
-        return Scope(_with_units(["Time", *first[1:]], units), 2, (start, step))
+        return _with_units(["Time", *first[1:]], units), 2, (start, step)
     if words[:1] == ["record length"] and len(first) > 4:
         entries = {cells[0].casefold(): cells[1] for cells in rows if len(cells) > 1}
         units = [entries.get(f"{axis} units", "") for axis in ("horizontal", "vertical")]
         named = _with_units(["Time", entries.get("source", "")], units)
-        return Scope(["", "", "", *named, *first[5:]], 0)
+        return ["", "", "", *named, *first[5:]], 0, None
     return None
 
 
