@@ -72,7 +72,7 @@ class Quantity:
     def check_limits(self, number: float, value: Any, where: str) -> None:
         """Raise InputError for a number that is not positive, or too large."""
         if (self.positive and number <= 0.0) or number >= self.below:
-            wanted = "positive" if self.below == math.inf else f"between 0 and {self.below:g}"
+            wanted = "positive" if number <= 0.0 else f"between 0 and {self.below:g}"
             raise InputError(f'{where} = "{value}" must be {wanted}, like "{self.example}".')
 
 

@@ -87,10 +87,12 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
     size = max(8, int(_TAIL * len(values)))
     step, n = max(4, size // 2), size
     level, rows = mean_level(values[-n:], noise), np.arange(n, dtype=np.float64)
-    for degree in (1, 2):
-        bend = polynomial_at(rows, values[-n:], 0.0, noise, degree)[-1]
-        if abs(bend.value) > _FLAT * bend.error:
-            return None
+    slope = polynomial_at(rows, values[-n:], 0.0, noise)[1]
+    # A crest is no parabola either: what that leaves must not count as noise.
+    (bend, *_), variance = np.polyfit(rows, values[-n:], 2, cov="unscaled")
+    error = noise.sigma * float(np.sqrt(noise.time * variance[0, 0]))
+    if abs(slope.value) > _FLAT * slope.error or abs(bend) > _FLAT * error:
+        return None
     while n + step < len(values) // 2:
         more = mean_level(values[-n - step : -n], noise)
         if abs(more.value - level.value) > float(np.hypot(more.error, level.error)):
@@ -118,8 +120,11 @@ def take_zeros(
             continue
         noise, size, unit = levels[name], float(np.ptp(values)), UNITS.get(name, "m")
         if sensor := name in ("stress", "acceleration"):
-            zero, how = _zero_of_sensor(values, n, noise, unit, impact=impact)
-            known, least = zero.samples > 0, -1.0
+            zero, how, drift = _zero_of_sensor(values, n, noise, impact=impact)
+            if drift:
+                drifts = f"The {name} drifts by {engineering(drift, unit)} in the {n} samples"
+                record = record.noted(f"{drifts} before contact, so its zero is as uncertain.")
+            known, least = zero.samples > 0, 0.0
             steps = _of_steps(values, values[:n]) if known else 0.0
             if impact and steps > zero.error:  # rows on one level do not show the zero again
                 away = np.ones(len(record), dtype=bool)
@@ -136,11 +141,11 @@ def take_zeros(
         elif not impact and not zero.samples and start.by == "file" and values[0] == 0.0:
             # The first row, which was set to zero, has an error unless the channel is exact.
             errors |= {name: noise.sigma} if noise.sigma > EXACT * size else {}
-        if zero.samples and abs(zero.value) > least * size:
+        if max(abs(zero.value), zero.error * sensor) > least * size:
             value = engineering(zero.value, unit)
             value += f" ± {engineering(zero.error, unit)}" if sensor else ""
             record = record.noted(f"The {name} at contact, {value}, is taken off ({how}).")
-        elif sensor and start.first:
+        elif sensor and start.first and not known:
             kept = f"the zero of the {name} in the file is kept"
             record = record.noted(f"Only {n} rows are certainly before contact: {kept}.")
         record = record.shifted(name, zero.value)
@@ -183,22 +188,24 @@ def without_drift(record: Record, start: Start, levels: Levels) -> Record:
 
 
 def _zero_of_sensor(
-    values: Array, n: int, noise: NoiseLevel, unit: str, *, impact: bool
-) -> tuple[Level, str]:
-    """Return the zero of a stress or acceleration from `n` rows at rest, or from the flat end."""
+    values: Array, n: int, noise: NoiseLevel, *, impact: bool
+) -> tuple[Level, str, float]:
+    """Return the zero of a stress or acceleration from `n` rows at rest, or from the flat end.
+
+    Return also where it is from, and the drift of the rows if that is significant.
+    """
     tail = tail_level(values, noise) if impact and n < _FEW else None
     if tail is not None and tail.samples > n:
-        return tail, f"mean of the last {tail.samples} rows, after the striker has left"
+        return tail, f"mean of the last {tail.samples} rows, after the striker has left", 0.0
     if n < _FEWEST:
-        return NOTHING, ""
+        return NOTHING, "", 0.0
     zero, how = mean_level(values[:n], noise), f"mean of {n} samples at rest before contact"
     slope = polynomial_at(np.arange(n, dtype=np.float64), values[:n], 0.0, noise)[1]
     rise = slope.value * n
-    if abs(rise) > max(0.01 * float(np.ptp(values)), 4 * slope.error * n):
-        kept = zero.value if abs(zero.value) > abs(rise) else 0.0
-        zero = Level(kept, float(np.hypot(zero.error, rise)), n)
-        how += f", in which it drifts by {engineering(rise, unit)}"
-    return zero, how
+    if abs(rise) <= max(0.01 * float(np.ptp(values)), 4 * slope.error * n):
+        return zero, how, 0.0
+    kept = zero.value if abs(zero.value) > abs(rise) else 0.0
+    return Level(kept, float(np.hypot(zero.error, rise)), n), how, rise
 
 
 def _zero_of_motion(
