@@ -30,8 +30,6 @@ _ABOVE = 40  # number of rows compared with the last row
 _NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?)", re.IGNORECASE | re.ASCII
 )
-# A number of usual size, whatever the decimal sign
-_PLAIN = {s: re.compile(rf"[+-]?\d+(?:[{s}]\d*)?(?:[eE][+-]?\d\d?)?", re.ASCII) for s in ",."}
 _MISSING = ("", "nan", "na", "n/a", "#n/a")  # what programs write for a missing number
 # A time of day such as 12:00:00.5 or 3:00:00.5 PM, with or without a date before it.
 _OF_DAY = re.compile(
@@ -88,6 +86,10 @@ class Table(Text):
         for row, cells in _cells(io.StringIO(self.content, newline=""), self.separator):
             if row > self.first_row and (len(cells) > 1 or "".join(cells).strip()):
                 yield row, cells
+
+    def body(self) -> str:
+        """Return the rows below the header."""
+        return self.content.split("\n", self.first_row)[-1] if self.first_row else self.content
 
 
 def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
@@ -289,8 +291,13 @@ def read_numbers(
 
     Times of day are converted to seconds. InputError names the first cell that is not a number.
     """
-    read, rows, dropped = _checked_numbers(table, columns)
-    for k, values in zip(columns.values(), read, strict=True):
+    places, dropped = list(columns.values()), list[Dropped]()
+    read = _plain_numbers(table, places)
+    if read is None:
+        read, rows, dropped = _checked_numbers(table, columns)
+    else:
+        rows = np.arange(table.first_row + 1, table.first_row + 1 + read.shape[1])
+    for k, values in zip(places, read, strict=True):
         _refuse_thousands(table, k, values)
         if table.clock is not None and k == 0:
             values[:] = table.clock[0] + table.clock[1] * values
@@ -298,6 +305,25 @@ def read_numbers(
         time = read[[*columns].index("time")]
         time[:] = np.unwrap(time, period=DAY)
     return dict(zip(columns, read, strict=True)), rows, dropped
+
+
+def _plain_numbers(table: Table, places: list[int]) -> Array | None:
+    """Read the columns (k, n) fast; None unless every row contains finite numbers."""
+    text = table.body().rstrip("\r\n")
+    comma = table.decimal == ","
+    if not text or (comma and ("." in text or table.separator == ",")):
+        return None
+    text = text.replace(",", ".") if comma else text
+    kinds = [(str(k), "f8" if k in places else "U1") for k in range(len(table.headers))]
+    try:
+        lines = io.StringIO(text, newline=None)
+        read = np.loadtxt(lines, kinds, None, table.separator, quotechar='"', ndmin=1)
+    except ValueError:
+        return None
+    numbers = np.array([read[str(k)] for k in places])
+    # A blank line, or a cell with line breaks, would shift the row numbers.
+    complete = read.size == text.count("\n") + 1 and np.isfinite(numbers).all()
+    return numbers if complete else None
 
 
 def _of_header(table: Table, row: int, cells: Sequence[str]) -> list[str]:
@@ -324,12 +350,6 @@ def _checked_numbers(
     places, below = list(columns.values()), list[tuple[int, InputError]]()
     measured = [k for name, k in columns.items() if name != "time"] or places
     for row, cells in table.rows():
-        if len(cells) == len(table.headers) and not below:  # mostly
-            plain = [cells[k] for k in places]
-            if all(map(_PLAIN[table.decimal].fullmatch, plain)):
-                numbers.extend([float(cell.replace(",", ".")) for cell in plain])
-                rows.append(row)
-                continue
         cells = _of_header(table, row, cells)
         if all(cells[k].lower() in _MISSING for k in measured):
             filled = [cell for cell in cells if cell.lower() not in _MISSING]
@@ -389,7 +409,7 @@ def without_cut_row(table: Table) -> tuple[Table, list[Dropped]]:
     Such a row has no line end. It has fewer cells than the rows above, or its last number ends in
     the decimal sign, or has fewer decimals while the `_ABOVE` rows above all have the same number.
     """
-    above = table.content.split("\n", table.first_row)[-1].rsplit("\n", _ABOVE)[1:]
+    above = table.body().rsplit("\n", _ABOVE)[1:]
     if len(above) < MIN_ROWS or not above[-1].strip() or '"' in above[-1]:
         return table, []
     *whole, last = ([c.strip() for c in line.split(table.separator)] for line in above)
