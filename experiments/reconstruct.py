@@ -11,8 +11,6 @@ loop, because foam-1 at 1.75 m/s never leaves branch d.
     python experiments/reconstruct.py
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

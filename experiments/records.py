@@ -5,8 +5,6 @@ folder and writes its TOML beside it, as a user keeps it. Foams whose records ha
 are read with `cycle` or `cycles`; "turbo-comp-1 cycles" are those of turbo-comp-1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

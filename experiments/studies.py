@@ -7,8 +7,6 @@ and `sheet` draws figures. Each study has its own seeds: each case draws from
 studies can be.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import platform

@@ -6,8 +6,6 @@ Method and answer: README.md, whose numbers are in batch.json.
     python experiments/batch/batch.py speedup       # one of them; see MEASURES
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

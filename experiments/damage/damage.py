@@ -5,8 +5,6 @@ Method and answer: README.md. Also written: twins.csv, lattice.csv and lattice.p
     FOAMFIT_DATA=… python experiments/damage/damage.py
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from pathlib import Path
@@ -28,9 +26,6 @@ NAMES = tuple(f"s1_{name}" for name in (*studies.MICROSCALE, "g1", "tau1"))
 SHOWN = ("start_strain", "dissipated_energy", "misfit_stress_strain", *NAMES)
 SHARES = ("start_strain", "misfit_stress_strain")
 LATTICE_CYCLES = (1, 2, 10, 100, 1000)
-
-
-# ------------------------------------------------------------------------------- the twins
 
 
 def fit_twins(folder: Path) -> pd.DataFrame:
@@ -96,9 +91,6 @@ def twin_changes(table: pd.DataFrame) -> str:
         )
     lines.append("- Worn against new: see the study of [twins](../twins/README.md).")
     return "\n".join(lines)
-
-
-# ------------------------------------------------------------------------------- the lattices
 
 
 def fit_lattices(folder: Path) -> tuple[pd.DataFrame, dict[str, ff.CycleFits]]:

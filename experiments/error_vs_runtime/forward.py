@@ -9,8 +9,6 @@ table and a figure per scene and summary.csv go to `forward/`.
     python experiments/error_vs_runtime/forward.py --scaling            # prints ns by size
 """
 
-from __future__ import annotations
-
 import sys
 import textwrap
 import time
@@ -64,9 +62,6 @@ SOLVERS: dict[str, dict[str, Any]] = {
     f"{SCIPY} LSODA": {"color": SKY, "marker": "^"},
     f"{SCIPY} Radau": {"color": ORANGE, "marker": "v"},
 }
-
-
-# ---------------------------------------------------------------- scenes and solvers
 
 
 def powers(first: int, last: int) -> tuple[float, ...]:
@@ -220,9 +215,6 @@ def error_of(answer: Answer, truth: Answer) -> float:
     return worst
 
 
-# ---------------------------------------------------------------- times
-
-
 @dataclass
 class Timed:
     """A solver at one tolerance with its error, an approximate time, and its measured times."""
@@ -276,9 +268,6 @@ def take_turns(timed: list[Timed], budget: float) -> None:
             if one.first < BRIEF:  # the previous run has displaced the caches
                 one.run()
             one.times.append(seconds(one.run, together))
-
-
-# ---------------------------------------------------------------- figures and tables
 
 
 def draw_scene(table: pd.DataFrame, title: str, path: Path) -> None:

@@ -6,8 +6,6 @@ whose ends are where it is cut off. Synthetic: a simulation of published paramet
     python experiments/error_vs_runtime/steps.py        # writes docs/_static/steps.png, in seconds
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

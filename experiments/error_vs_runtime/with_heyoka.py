@@ -4,8 +4,6 @@ It is compiled just in time, and finds ends of branches and of contact as termin
 an optional dependency of this study alone: `pip install heyoka`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

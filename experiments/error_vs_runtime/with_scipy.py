@@ -5,8 +5,6 @@ objects are stepped directly (`solve_ivp` costs more per step), and a switch is 
 solver's dense output.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -6,8 +6,6 @@ Method and tolerances: README.md. The answer is the list of differences, if any.
     python experiments/frozen/frozen.py --renew    # write frozen.csv
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Iterator

@@ -8,8 +8,6 @@ foam is omitted.
     python experiments/identification/identification.py --redraw          # figures and page only
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -74,9 +72,6 @@ STYLES = {
 }
 
 
-# ---------------------------------------------------------------- problems
-
-
 @dataclass(frozen=True)
 class Case:
     """An identification problem: record, model and drive."""
@@ -119,9 +114,6 @@ CASES = {
         "turbo-comp-1", "bistable", "displacement",
     ),
 }  # fmt: skip
-
-
-# ---------------------------------------------------------------- one run
 
 
 class RunOver(Exception):  # noqa: N818 (nothing went wrong)
@@ -270,9 +262,6 @@ def _options(method: str, seed: int) -> dict[str, object]:
     return {}
 
 
-# ---------------------------------------------------------------- all runs
-
-
 def best_known(case: Case, problem: Problem) -> float:
     """Return the lowest cost of three long searches, which also compile everything."""
     costs = []
@@ -305,9 +294,6 @@ def run_all(options: argparse.Namespace) -> tuple[pd.DataFrame, dict[str, Any]]:
     machine = studies.circumstances("foamfit", "lmfit", "scipy", "numpy", "numba")
     setup = {"machine": machine, "budget_s": options.budget, "known": known}
     return pd.DataFrame(rows, columns=[*RUN, "seconds", "cost"]), setup
-
-
-# ---------------------------------------------------------------- page and figures
 
 
 def solved_after(runs: pd.DataFrame, known: dict[str, float]) -> pd.DataFrame:

@@ -7,8 +7,6 @@ Method and answer: README.md. The foam is a microscale spring under a slow trian
     python experiments/joint/joint.py --only log --draws 20 --out FOLDER
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path

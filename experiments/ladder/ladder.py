@@ -6,8 +6,6 @@ Method and answer: README.md. Also written: structures.csv (a row for each test)
     python experiments/ladder/ladder.py --tests 2 --out FOLDER
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from dataclasses import replace
@@ -38,9 +36,6 @@ STRUCTURES = [
 
 def name_of(model: str, damped: bool) -> str:
     return f"{model} {'with' if damped else 'without'} damping"
-
-
-# ---------------------------------------------------------------- synthetic tests
 
 
 def bistable(rng: np.random.Generator, sigma_a: float, late: bool) -> ff.BistableSpring:
@@ -151,9 +146,6 @@ def climb(seed: int, kind: int, case: int) -> dict[str, Any]:
         "found": chosen.name == truth, "models tried": len(ladder.rungs),
         "seconds": time.perf_counter() - began,
     }  # fmt: skip
-
-
-# ---------------------------------------------------------------- what is written
 
 
 def structure_table(table: pd.DataFrame) -> str:

@@ -6,8 +6,6 @@ Method and answer: README.md. Also written: law_error.csv.
     python experiments/law_error/law_error.py --draws 20 --out FOLDER
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Iterator
@@ -41,9 +39,6 @@ class Curves:
     height: float
     area: float
     striker: tuple[float, float] | None = None  # mass and velocity
-
-
-# ---------------------------------------------------------------- laws that are not the fitted one
 
 
 SPRING = ff.BistableSpring(
@@ -179,9 +174,6 @@ def coverage(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
             "error of the law found": own["found"].mean(), "with a range": own["ranged"].mean(),
             "determined": (own["state"] == "determined").mean(), "seconds": own["seconds"].median(),
         }  # fmt: skip
-
-
-# ---------------------------------------------------------------- page
 
 
 def summary_of(table: pd.DataFrame) -> pd.DataFrame:

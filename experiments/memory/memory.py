@@ -6,8 +6,6 @@ parameters.csv (every parameter of every fit), ways_back.csv and memory.png.
     FOAMFIT_DATA=… python experiments/memory/memory.py          # --page: from the tables alone
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path

@@ -5,8 +5,6 @@ Method and answer: README.md. Also written: microscale.csv and microscale.png.
     python experiments/microscale/microscale.py
 """
 
-from __future__ import annotations
-
 import sys
 from itertools import pairwise
 from pathlib import Path

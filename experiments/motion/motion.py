@@ -6,8 +6,6 @@ Method and answer: README.md, which 225 draws of each class (a minute) write.
     python experiments/motion/motion.py --draws 4      # prints the tables only
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ Method and answer: README.md. Also written: other_laws.csv (a row per fit) and o
     FOAMFIT_DATA=… python experiments/other_laws/other_laws.py    # --jobs 2 is faster
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import sys
@@ -72,9 +70,6 @@ TESTS = (
 SHOWN = ("turbo-comp-1", "outplane-4s-1", "tpu87-20 cycle 10", "cartilage 1")
 
 
-# ------------------------------------------------------------------------------- the tests
-
-
 def read(name: str, folder: Path) -> ff.Measurement:
     """Read a test like a user, and thin it."""
     record, _, cycle = name.partition(" cycle ")
@@ -89,9 +84,6 @@ def thinned(test: ff.Measurement, path: Path) -> ff.Measurement:
     toml = f'name = "{test.name}"\n[specimen]\nheight = "{own.height} m"\narea = "{own.area} m^2"\n'
     columns = {name: getattr(test, name)[::step] for name in ("time", "stress", "displacement")}
     return ff.read_test(studies.write_test(path, toml, **columns))
-
-
-# ------------------------------------------------------------------------------- the fits
 
 
 def fit_all(case: tuple[str, str, str], starts: int) -> list[dict[str, Any]]:
@@ -130,9 +122,6 @@ def predicted(result: Any, test: ff.Measurement) -> dict[str, float]:
         name: float(np.sqrt(np.mean((curve - one.measured) ** 2)) / np.ptp(one.measured))
         for name, curve in off.items()
     }
-
-
-# ------------------------------------------------------------------------------- page and picture
 
 
 def law_table(table: pd.DataFrame) -> str:

@@ -4,8 +4,6 @@ Thevamaran, Fraternali & Daraio 2014, Tables 1-3. A stress drive is the base str
 impact, so the exact response is known.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -29,9 +27,6 @@ OTHER_VELOCITIES = (1.75, 1.9, 2.0, 2.1, 2.3, 2.5)  # m/s, to show the influence
 SAMPLES = 4001  # of a drive, over the contact
 RTOL = 1e-9
 TURN = 1e-3  # of the range; smaller turns of a curve are not counted
-
-
-# ------------------------------------------------------------------- stress drive: claims 1, 2
 
 
 @dataclass(frozen=True)
@@ -152,9 +147,6 @@ def slowed(drive: Drive, damper: float, slower: float) -> float:
     return displacement_error(drive, STRIKER / slower**2, damper / slower)
 
 
-# ------------------------------------------------------------------------- damping ratios: claim 3
-
-
 def ratio_readings(name: str, eta: float | None = None) -> dict[str, float]:
     """Return ζ = η/(2 H √(ρ k)), ρ = m/(A H), of a published set by each reading."""
     item, other = (
@@ -206,9 +198,6 @@ def ratio_wanted() -> dict[str, float]:
         "height": item.chain.height / factor**2,
         "diameter": math.sqrt(4.0 / math.pi * item.chain.area) * factor,
     }
-
-
-# ------------------------------------------------------------------------- energy: claim 4
 
 
 def impact_scene(name: str, interior: bool = True, **spring: float) -> ff.Chain:

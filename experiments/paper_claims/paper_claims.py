@@ -6,8 +6,6 @@ parameters (Thevamaran, Fraternali & Daraio 2014, Tables 1-3).
     python experiments/paper_claims/paper_claims.py
 """
 
-from __future__ import annotations
-
 import math
 import re
 import sys
@@ -57,9 +55,6 @@ from studies import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILION
 
 HERE = Path(__file__).parent
 Array = NDArray[np.float64]
-
-
-# ------------------------------------------------------------------------- figures
 
 
 def mark(ax: Any, x: float, text: str, y: float = 0.03, dx: int = 3, **more: Any) -> None:
@@ -150,9 +145,6 @@ def draw_energy(path: Path) -> None:
         )
         ax.set(ylabel="energy lost (% of striker's)", yticks=[0, 25, 50, 75, 100])
         ax.legend(loc="upper left", ncols=2, columnspacing=0.8, handlelength=1.2, fontsize=6.5)
-
-
-# ------------------------------------------------------------------------- the page
 
 
 def main() -> None:

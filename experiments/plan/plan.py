@@ -7,8 +7,6 @@ Method and answer: README.md. Also written: foams.csv.gz, plan.csv and plan.png.
     python experiments/plan/plan.py --page                 # the page alone
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import time

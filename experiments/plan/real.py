@@ -5,8 +5,6 @@ Method and answer: README.md. Written: real.csv; plan.py then writes the page.
     FOAMFIT_DATA=… python experiments/plan/real.py
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Iterator

@@ -6,8 +6,6 @@ real_foams.png (one loop, two laws).
     FOAMFIT_DATA=… python experiments/real_foams/real_foams.py     # two minutes of processor time
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path

@@ -5,14 +5,13 @@ Method and answer: README.md. Also written: fits.csv and loops.csv.
     FOAMFIT_DATA=… python experiments/real_records/real_records.py   # 8 minutes
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -68,7 +67,7 @@ class Judge:
     peak: float  # Pa, above that
 
     @classmethod
-    def of(cls, real: Real, path: Path) -> Judge:
+    def of(cls, real: Real, path: Path) -> Self:
         """Read a file."""
         table = pd.read_csv(path)
         instants = table["time_s"].to_numpy(float)
@@ -124,9 +123,6 @@ def fits(folder: Path) -> Iterator[dict[str, object]]:
                     ),
                     "seconds": seconds, "excluded": "; ".join(wrong) or "nothing",
                 }  # fmt: skip
-
-
-# ------------------------------------------------------------------------- plain least squares
 
 
 def loops(folder: Path) -> Iterator[ff.Measurement]:

@@ -6,8 +6,6 @@ three times without losing contact. Nothing here comes from foamfit: the stress 
 by bisection over the chain.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -9,8 +9,6 @@ follows a given motion, recorded with noise, until the stress returns to zero. F
 always draws the same springs, striker and noise of a channel, whatever else is recorded.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace

@@ -9,8 +9,6 @@ fitted gets a row with the message.
     python experiments/recovery/rigs.py --family slow --classes microscale --tests 20
 """
 
-from __future__ import annotations
-
 import re
 import sys
 import time

@@ -5,8 +5,6 @@ Method and answer: README.md. Also written: scatter.csv.
     FOAMFIT_DATA=… python experiments/scatter/scatter.py       # ten minutes
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ A scene is drawn as a specification, a dictionary that JSON can hold, from the s
 its number. README.md describes the families.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import asdict, replace

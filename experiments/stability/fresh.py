@@ -9,8 +9,6 @@ and rtol to fresh.csv:
 Another checkout's solver is judged with PYTHONPATH=that/checkout/src.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math
@@ -46,9 +44,6 @@ def by_roots(scene: Scene) -> Truth:
     import roots  # only this judge needs mpmath
 
     return roots.follow(*scene)
-
-
-# ------------------------------------------------------------------------------- the derivatives
 
 
 def moved(spec: Spec, name: str, factor: float) -> tuple[Spec, float]:
@@ -128,9 +123,6 @@ def slope_error(spec: Spec, scene: Scene, rtol: float, most: int, known: dict[st
         miss = np.abs(mine - want)[:, counts].max(axis=1) / span
         worst = np.nanmax([worst, miss.max() if np.isfinite(miss).all() else math.inf])
     return float(worst)
-
-
-# ----------------------------------------------------------------------------------- the judgement
 
 
 SIDES = "plus", "minus"
@@ -246,9 +238,6 @@ def wrong(lines: pd.DataFrame) -> pd.DataFrame:
     return lines[(lines.error > POOR) | (lines.slope > lines.rtol.map(slope_bar))]
 
 
-# ---------------------------------------------------------------------------------------- the page
-
-
 def write_page() -> None:
     """Write README.md from the stored scenes."""
     lines = pd.read_csv(KEPT)
@@ -265,9 +254,6 @@ def write_page() -> None:
         worn_scenes=worn.scene.nunique(),
         fresh_each=int(lines.groupby("family").scene.nunique().max()),
     )  # fmt: skip
-
-
-# ------------------------------------------------------------------------------------ the command
 
 
 def compile_all(families: tuple[str, ...]) -> None:

@@ -28,8 +28,6 @@ in steps of at most one standard deviation. Stiff scenes take many steps: beyond
 judgement.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple

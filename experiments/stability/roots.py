@@ -7,8 +7,6 @@ state: the flag of a bistable spring, the ranks of a microscale one. Nothing is 
 neither the times of the samples nor the width of a snap matter. Laws: docs/theory.md.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

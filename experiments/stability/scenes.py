@@ -3,8 +3,6 @@
 Everything is generated from a seed, in SI units. Springs, histories and durations are synthetic.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -161,9 +159,6 @@ def scene_from(spec: Spec) -> Scene:
         return chain, ff.DisplacementDrive(np.interp(way, at, levels)), grid
     values = np.interp(grid, spec["stop"] * (at - at[0]) / (at[-1] - at[0]), levels)
     return chain, (ff.StressDrive if drive == "stress" else ff.DisplacementDrive)(values), grid
-
-
-# ------------------------------------------------------------------------------------- the design
 
 
 def _log(u: float, low: float, high: float) -> float:

@@ -8,8 +8,6 @@ functions.
     python experiments/start_up/start_up.py --rows 1000000 --warm 1 --first 0
 """
 
-from __future__ import annotations
-
 import os
 import resource
 import statistics

@@ -5,13 +5,11 @@ Method and answer: README.md. Also written: wear.csv and a figure.
     FOAMFIT_DATA=… python experiments/twins/twins.py    # --page: from the table alone
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
@@ -44,9 +42,6 @@ LEVEL = 0.05  # significance level, for all comparisons of a cycle together
 POINTS = 200  # of a mean loop
 # Measured strain and stress of each specimen by group.
 Loops = Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]]
-
-
-# ------------------------------------------------------------------------------- fits
 
 
 def measure(folder: Path) -> None:
@@ -98,9 +93,6 @@ def mean_loop(group: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarra
     return np.mean(strains, axis=0), np.mean(stresses, axis=0), np.std(stresses, axis=0, ddof=1)
 
 
-# ------------------------------------------------------------------------------- comparison
-
-
 class Group(NamedTuple):
     """Logarithm of a quantity of a group: mean, standard error, spread between specimens."""
 
@@ -110,14 +102,14 @@ class Group(NamedTuple):
     count: int
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Group:
+    def of(cls, values: Sequence[float]) -> Self:
         """Make a group from measured values, whose errors are negligible against their spread."""
         logs = np.log(values)
         spread = float(np.std(logs, ddof=1))
         return cls(float(np.mean(logs)), spread / math.sqrt(len(logs)), spread, len(logs))
 
     @classmethod
-    def of_joint(cls, item: Mapping[str, Any]) -> Group:
+    def of_joint(cls, item: Mapping[str, Any]) -> Self:
         """Make a group from a scattering parameter of joint.json, without measurement error."""
         value, error = item["value"], item["stderr"]
         return cls(math.log(value), error / value, item["scatter"], len(item["tests"]))
@@ -167,9 +159,6 @@ def wear(found: Mapping[str, Mapping[str, Any]], measured: Loops) -> pd.DataFram
         new, worn = (Group.of_joint(found[group]["parameters"][name]) for group in GROUPS)
         rows.append(change_of(name, new, worn))
     return counted_together(pd.DataFrame(rows))
-
-
-# ------------------------------------------------------------------------------- the page
 
 
 def shown_change(one: Any) -> str:

@@ -5,8 +5,6 @@ Method and answer: README.md.
     FOAMFIT_DATA=… python experiments/whole_fits/whole_fits.py       # 5 minutes
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Iterator
