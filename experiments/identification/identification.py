@@ -19,14 +19,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import lmfit
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
@@ -47,11 +46,11 @@ ENOUGH = 1.001  # cost over the best known at which a run ends
 RECORDED = 0.98  # a cost is recorded below this multiple of the last recorded one
 RUN = ["problem", "coordinates", "method", "seed"]
 OWN = "foamfit.fit"
-LEAST_SQUARES = ("leastsq", "least_squares")
+SEEDED = ("differential_evolution", "basinhopping", "dual_annealing")
 GROUPS = {
-    "least squares": LEAST_SQUARES,
+    "least squares": ("leastsq", "least_squares"),
     "direct": ("nelder", "powell"),
-    "global": ("differential_evolution", "basinhopping", "dual_annealing", "ampgo"),
+    "global": (*SEEDED, "ampgo"),
 }
 METHODS = tuple(name for group in GROUPS.values() for name in group)
 COORDINATES = {
@@ -72,47 +71,39 @@ STYLES = {
 }
 
 
-@dataclass(frozen=True)
-class Case:
-    """An identification problem: record, model and drive."""
+class Case(NamedTuple):
+    """An identification problem."""
 
     title: str
-    record: str  # a file below experiments/, or a measurement of others
+    record: str  # a reconstruction of foam-1, or a measurement of others
     model: str
     drive: str
 
     @property
     def by_others(self) -> bool:
         """Whether the record is not part of this repository."""
-        return not self.record.endswith(".csv")
+        return self.record in records.SHOE_FOAM
 
     def problem(self) -> Problem:
         """Read the test and set up the problem, as `foamfit.fit` does."""
-        if self.by_others:
-            with studies.workplace() as folder:
-                test = ff.read_test(records.place(self.record, folder))
-        else:
-            test = ff.read_test(HERE.parent / self.record)
+        with studies.workplace() as folder:
+            path = HERE.parent / f"foam-1/{self.record}-2.0mps-reconstruction.csv"
+            test = ff.read_test(records.place(self.record, folder) if self.by_others else path)
         return make_problem(test, self.model, self.drive, None, None, False)
 
 
 CASES = {
-    "impact": Case(
-        "One spring, impact (reconstruction of foam-1)",
-        "foam-1/model-1-2.0mps-reconstruction.csv", "bistable", "impact",
-    ),
-    "displacement": Case(
-        "One spring, displacement drive (the same test)",
-        "foam-1/model-1-2.0mps-reconstruction.csv", "bistable", "displacement",
-    ),
-    "chain": Case(
-        "Linear + bistable, impact (reconstruction of foam-1)",
-        "foam-1/model-3-2.0mps-reconstruction.csv", "linear+bistable", "impact",
-    ),
-    "shoe-foam": Case(
-        "One spring, shoe foam (measurement: arXiv:2602.12694)",
-        "turbo-comp-1", "bistable", "displacement",
-    ),
+    "impact":
+        Case("One spring, impact (reconstruction of foam-1)", "model-1", "bistable", "impact"),
+    "displacement":
+        Case("One spring, displacement drive (the same test)", "model-1", "bistable",
+             "displacement"),
+    "chain":
+        Case("Linear + bistable, impact (reconstruction of foam-1)", "model-3", "linear+bistable",
+             "impact"),
+    "shoe-foam":
+        Case("One spring, shoe foam (measurement: arXiv:2602.12694)", "turbo-comp-1", "bistable",
+             "displacement"),
 }  # fmt: skip
 
 
@@ -163,16 +154,10 @@ def recorded(
     return [*rows, (min(time.process_time() - began, budget), lowest)]
 
 
-def fitted(case: Case, problem: Problem, **options: Any) -> ff.FitResult:
-    """Fit a problem by foamfit's search."""
-    options |= {"model": case.model, "drive": case.drive, "intervals": "local"}
-    return ff.fit(problem.measurement, **options)
-
-
-def run_own(case: Case, problem: Problem, seed: int) -> None:
+def run_own(search: Callable[..., ff.FitResult], seed: int) -> None:
     """Fit repeatedly by foamfit's search, each time with another seed."""
     for again in range(1000):
-        fitted(case, problem, seed=1000 * seed + again)
+        search(seed=1000 * seed + again)
 
 
 @dataclass(frozen=True)
@@ -237,9 +222,12 @@ def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int) -> Non
     rng, points = np.random.default_rng(seed), list[Array]()
     while True:
         points = points or list(box_starts(variables.space, rng, 32))
-        start, options = points.pop(0), _options(method, int(rng.integers(2**31)))
-        if method in LEAST_SQUARES:
-            options |= {"Dfun" if method == "leastsq" else "jac": variables.jacobian}
+        start, draw = points.pop(0), int(rng.integers(2**31))
+        np.random.seed(draw)  # noqa: NPY002 (lmfit's ampgo draws from there)
+        options: dict[str, Any] = {  # of an experienced user
+            "leastsq": {"Dfun": variables.jacobian},
+            "least_squares": {"jac": variables.jacobian, "x_scale": "jac"},
+        }.get(method, {"seed": draw} if method in SEEDED else {})
         with (
             warnings.catch_warnings(action="ignore"),  # about covariances of lmfit, not used here
             np.errstate(all="ignore"),
@@ -251,27 +239,6 @@ def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int) -> Non
             )  # fmt: skip
 
 
-def _options(method: str, seed: int) -> dict[str, object]:
-    """Return the options of an experienced user: random seed, scales of least_squares."""
-    if method == "least_squares":
-        return {"x_scale": "jac"}
-    if method in ("differential_evolution", "basinhopping", "dual_annealing"):
-        return {"seed": seed}
-    if method == "ampgo":
-        np.random.seed(seed)  # noqa: NPY002 (lmfit's ampgo draws from there)
-    return {}
-
-
-def best_known(case: Case, problem: Problem) -> float:
-    """Return the lowest cost of three long searches, which also compile everything."""
-    costs = []
-    for seed in range(9000, 9003):
-        found = fitted(case, problem, seed=seed, starts=96).problem
-        residual = problem.objective.residual(found.vector())  # without the file's zeros
-        costs.append(float(residual @ residual))
-    return min(costs)
-
-
 def run_all(options: argparse.Namespace) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Run every method on every problem and seed; return the runs and their setup."""
     known, rows = dict[str, float](), list[tuple[Any, ...]]()
@@ -280,12 +247,16 @@ def run_all(options: argparse.Namespace) -> tuple[pd.DataFrame, dict[str, Any]]:
         if case.by_others and not os.environ.get("FOAMFIT_DATA"):
             print(f"{key}: left out, FOAMFIT_DATA names no folder of measurements")
             continue
-        problem = case.problem()
-        known[key] = best_known(case, problem)
+        problem, own = case.problem(), {"model": case.model, "drive": case.drive}
+        search = partial(ff.fit, problem.measurement, intervals="local", **own)
+        # The lowest cost of three long searches without the file's zeros; they compile everything.
+        long = [search(seed=seed, starts=96).problem.vector() for seed in range(9000, 9003)]
+        ends = [problem.objective.residual(vector) for vector in long]
+        known[key] = min(float(residual @ residual) for residual in ends)
         for coordinates, method in [("own", OWN), *((c, m) for c in COORDINATES for m in METHODS)]:
             for seed in range(options.seeds):
                 if method == OWN:
-                    work = partial(run_own, case, problem, seed)
+                    work = partial(run_own, search, seed)
                 else:
                     work = partial(run_lmfit, problem, method, coordinates, seed)
                 found = recorded(work, problem.objective, options.budget, known[key])
@@ -299,9 +270,8 @@ def run_all(options: argparse.Namespace) -> tuple[pd.DataFrame, dict[str, Any]]:
 def solved_after(runs: pd.DataFrame, known: dict[str, float]) -> pd.DataFrame:
     """Return one row for each run: seconds to solution (inf if never)."""
     solved = runs["cost"] <= SOLVED * runs["problem"].map(known)
-    first = runs[solved].groupby(RUN)["seconds"].first()
-    every = pd.MultiIndex.from_frame(runs[RUN].drop_duplicates())
-    return first.reindex(every).fillna(np.inf).rename("solved_after_s").reset_index()
+    after = runs.assign(solved_after_s=runs["seconds"].where(solved, np.inf))
+    return after.groupby(RUN, sort=False)["solved_after_s"].min().reset_index()
 
 
 def draw_curves(
@@ -328,8 +298,10 @@ def draw_curves(
         seeds = runs["seed"].nunique()
         heading = f"{COORDINATES[coordinates]}: median and quartiles of {seeds} seeds"
         figure.suptitle(heading, fontsize=8)
-        handles = [Line2D([], [], label=name, **_line(name)) for name in STYLES]
-        figure.legend(handles=handles, loc="outside lower center", ncols=5, handlelength=3.2)
+        for name in STYLES:
+            axes.plot([], [], label=name, **_line(name))
+        handles = axes.get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=5, handlelength=3.2)
 
 
 def _band(axes: Axes, elapsed: Array, runs: pd.DataFrame, known: float, name: str) -> None:
