@@ -54,7 +54,7 @@ def arguments(doc: str | None, out: Path | None = None, **numbers: Any) -> argpa
         default, what = given if isinstance(given, tuple) else (given, None)
         parser.add_argument(f"--{name}", type=type(default), default=default, help=what)
     if out is not None:
-        parser.add_argument("--out", type=Path, default=out, help="output folder")
+        parser.add_argument("--out", type=Path, default=out, help="where results are written")
     return parser
 
 

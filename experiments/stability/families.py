@@ -6,7 +6,7 @@ its number. README.md describes the families.
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import cache, partial
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.random import Generator
 from scipy.optimize import minimize_scalar
 
 import foamfit as ff
-from scenes import Point, Spec, designed
+from scenes import Spec, designed
 from studies import MICROSCALE
 
 SEED = 2027
@@ -31,15 +31,10 @@ def bistable(rng: Generator, k0: float, eta: float = 0.0) -> Spec:
     eps_a = log(rng, 0.02, 0.5)
     sigma_a = k0 * eps_a / (1.0 - eps_a)
     return {
-        "k0": k0,
-        "kc": k0 * log(rng, 2.0, 100.0),
-        "dsigma": -sigma_a * rng.uniform(0.0, 0.95),
-        "eps_a": eps_a,
-        "eps_c": eps_a + (0.9 - eps_a) * rng.uniform(0.1, 0.9),
-        "kh_plus": k0 * log(rng, 0.1, 30.0),
-        "kh_minus": k0 * log(rng, 0.05, 5.0),
-        "eta": eta,
-    }
+        "k0": k0, "kc": k0 * log(rng, 2.0, 100.0), "dsigma": -sigma_a * rng.uniform(0.0, 0.95),
+        "eps_a": eps_a, "eps_c": eps_a + (0.9 - eps_a) * rng.uniform(0.1, 0.9),
+        "kh_plus": k0 * log(rng, 0.1, 30.0), "kh_minus": k0 * log(rng, 0.05, 5.0), "eta": eta,
+    }  # fmt: skip
 
 
 def foam(rng: Generator, k0: float, eta: float = 0.0) -> Spec:
@@ -48,9 +43,8 @@ def foam(rng: Generator, k0: float, eta: float = 0.0) -> Spec:
     item = ff.published[names[int(rng.integers(len(names)))]].bistable
     near = {
         key: value * rng.uniform(0.93, 1.07) * (1.0 if key.startswith("eps") else k0 / item.k0)
-        for key, value in asdict(item).items()
-        if key != "relaxation"
-    }
+        for key, value in asdict(item).items() if key != "relaxation"
+    }  # fmt: skip
     sigma_a = near["k0"] * near["eps_a"] / (1.0 - near["eps_a"])
     near["dsigma"] = item.dsigma / item.sigma_a * sigma_a * rng.uniform(0.93, 1.07)
     return near | {"eta": eta}
@@ -68,12 +62,9 @@ def chain_of(
     """Return a chain with different heights."""
     share = rng.uniform(0.5, 1.5, len(springs))
     return {
-        "springs": springs,
-        "heights": list(height * share / share.sum()),
-        "area": log(rng, 5e-6, 5e-5),
-        "masses": masses,
-        "site": site,
-    }
+        "springs": springs, "heights": list(height * share / share.sum()),
+        "area": log(rng, 5e-6, 5e-5), "masses": masses, "site": site,
+    }  # fmt: skip
 
 
 def bounce(spec: Spec, mass: float) -> float:
@@ -91,16 +82,13 @@ def struck(rng: Generator, spec: Spec, low: float, high: float) -> None:
 
 
 def study(number: int) -> Spec:
-    return {"point": asdict(_designed()[number])}
+    """Return a designed scene, within the limits of brute force."""
+    point = _designed()[number]
+    few = {"springs": min(point.springs, 12), "samples": min(point.samples, 2001)}
+    return {"point": asdict(point) | few}
 
 
-@cache
-def _designed() -> list[Point]:
-    # limits for brute force: no very long chains and histories
-    return [
-        replace(p, springs=min(p.springs, 12), samples=min(p.samples, 2001))
-        for p in designed(1000, SEED)
-    ]
+_designed = cache(partial(designed, 1000, SEED))
 
 
 def base(rng: Generator, number: int) -> Spec:
@@ -109,15 +97,12 @@ def base(rng: Generator, number: int) -> Spec:
         item = ff.published["foam-2"]
         springs = [asdict(s) for s in item.chain.springs]
         springs[0]["eta"] = log(rng, 3e2, 1e6)
-        spec: Spec = {
-            "springs": springs,
-            "heights": list(item.chain.heights),
-            "area": item.chain.area,
+        return {
+            "springs": springs, "heights": list(item.chain.heights), "area": item.chain.area,
             "masses": [log(rng, 1e-6, 2e-3), 0.0],
             "site": item.chain.site_damping if rng.random() < 0.3 else 0.0,
-            "impact": [item.striker_mass, 4.44],
-        }
-        return spec | {"stop": log(rng, 1e-5, 1.5e-3), "samples": 301}
+            "impact": [item.striker_mass, 4.44], "stop": log(rng, 1e-5, 1.5e-3), "samples": 301,
+        }  # fmt: skip
     k0 = log(rng, 1e5, 3e7)
     count = 2 if rng.random() < 0.7 else 3
     springs = [bistable(rng, k0 * log(rng, 0.5, 2.0)) for _ in range(count)]
@@ -157,11 +142,9 @@ def gap(rng: Generator, number: int) -> Spec:
     inertia = rng.random() < 0.5 or number % 3 == 0
     masses = [log(rng, 1e-6, 5e-3) if inertia else 0.0 for _ in range(count - 1)] + [0.0]
     spec = chain_of(rng, springs, log(rng, 3e-4, 3e-3), masses)
-    names = []
-    for i, spring in enumerate(springs, start=1):
-        own = ["k0", "height"] if "unilateral" in spring else ["k0", "kc", "eps_a", "kh_plus"]
-        names.append(f"s{i}_{rng.choice(own)}")
-    spec["sensitivities"] = names
+    kinds = (["k0", "height"] if "unilateral" in s else ["k0", "kc", "eps_a", "kh_plus"]
+             for s in springs)  # fmt: skip
+    spec["sensitivities"] = [f"s{i}_{rng.choice(own)}" for i, own in enumerate(kinds, start=1)]
     if number % 3 == 0:
         struck(rng, spec, 0.05, 3.0)
         whole = bounce(spec, spec["impact"][0])
@@ -183,10 +166,8 @@ def turns(rng: Generator, number: int) -> Spec:
     """Draw histories of displacement or stress with arbitrary turning points."""
     k0 = log(rng, 3e5, 3e7)
     count = int(rng.integers(1, 4))
-    springs = [
-        linear(rng, k0) if rng.random() < 0.25 and count > 1 else bistable(rng, k0)
-        for _ in range(count)
-    ]
+    springs = [linear(rng, k0) if rng.random() < 0.25 and count > 1 else bistable(rng, k0)
+               for _ in range(count)]  # fmt: skip
     inertia, damped = rng.random() < 0.5, rng.random() < 0.6
     masses = [log(rng, 1e-7, 1e-2) if inertia else 0.0 for _ in range(count)]
     stressed = number % 2 == 1
@@ -203,11 +184,10 @@ def turns(rng: Generator, number: int) -> Spec:
     if rng.random() < 0.3:
         spec["site"] = k0 * stop * log(rng, 1e-4, 1.0)
     number_of_turns = int(rng.integers(1, 9))
-    if stressed:
-        spec["stress"] = list(path(rng, k0 * log(rng, 0.1, 3.0), number_of_turns))
-        spec["stress"][1] = [max(level, 0.0) for level in spec["stress"][1]]
-    else:
-        spec["displacement"] = list(path(rng, 0.8 * sum(spec["heights"]), number_of_turns))
+    most = k0 * log(rng, 0.1, 3.0) if stressed else 0.8 * sum(spec["heights"])
+    at, levels = path(rng, most, number_of_turns)
+    floor = 0.0 if stressed else -math.inf
+    spec["stress" if stressed else "displacement"] = [at, [max(x, floor) for x in levels]]
     return spec | {"stop": stop, "samples": int(rng.choice([21, 101, 501]))}
 
 
@@ -216,10 +196,8 @@ def long(rng: Generator, number: int) -> Spec:
     k0 = log(rng, 5e5, 3e7)
     count = int(rng.integers(3, 11))
     draw = foam if rng.random() < 0.5 else bistable
-    springs = [
-        linear(rng, k0) if rng.random() < 0.2 else draw(rng, k0 * log(rng, 0.7, 1.5))
-        for _ in range(count)
-    ]
+    springs = [linear(rng, k0) if rng.random() < 0.2 else draw(rng, k0 * log(rng, 0.7, 1.5))
+               for _ in range(count)]  # fmt: skip
     spec = chain_of(rng, springs, log(rng, 5e-4, 1e-2), [0.0] * count)
     kind = number % 4
     if kind < 2:
@@ -228,12 +206,11 @@ def long(rng: Generator, number: int) -> Spec:
         spec["stop"] = whole * log(rng, 0.2, 1.5)
     else:
         whole = spec["stop"] = log(rng, 1e-4, 1e-1)
-        way = path(rng, 0.7 * sum(spec["heights"]), int(rng.integers(1, 5)))
-        if kind == 2:
-            spec["displacement"] = list(way)
-        else:
-            spec["stress"] = [way[0], [k0 * log(rng, 0.1, 1.0) * max(x, 0.0)
-                                       / (0.7 * sum(spec["heights"])) for x in way[1]]]  # fmt: skip
+        most = 0.7 * sum(spec["heights"])
+        at, levels = path(rng, most, int(rng.integers(1, 5)))
+        if kind == 3:
+            levels = [k0 * log(rng, 0.1, 1.0) * max(x, 0.0) / most for x in levels]
+        spec["displacement" if kind == 2 else "stress"] = [at, levels]
     # masses whose vibration covers this many radians
     radians = log(rng, 30.0, 3e5)
     stiff = 4.0 * k0 * spec["area"] * count / sum(spec["heights"])
@@ -261,14 +238,11 @@ def microscale(rng: Generator, k0: float) -> Spec:
         wide[1] = wide[0]
     sigma_plus = k0 * log(rng, 0.02, 2.0)
     return {
-        "k0": k0,
-        "kc": kc,
+        "k0": k0, "kc": kc,
         "eps_star": least * (1.0 + 1e-12) + (0.0 if rng.random() < 0.1 else rng.uniform(0.0, 0.6)),
-        "sigma_plus": sigma_plus,
-        "spread_plus": wide[0],
-        "sigma_minus": sigma_plus * log(rng, 0.02, 1.5),
-        "spread_minus": wide[1],
-    }
+        "sigma_plus": sigma_plus, "spread_plus": wide[0],
+        "sigma_minus": sigma_plus * log(rng, 0.02, 1.5), "spread_minus": wide[1],
+    }  # fmt: skip
 
 
 def worn(rng: Generator, k0: float) -> Spec:
@@ -282,9 +256,8 @@ def worn(rng: Generator, k0: float) -> Spec:
     k, kc, n = k0 * math.exp(-spec["softening"]), spec["kc"], spec["stiffening"]
 
     def excess(log_s: float) -> float:  # strain of branch a minus that of branch c
-        return -math.expm1(-math.log1p(n * math.exp(log_s)) / n) - 1.0 / (
-            1.0 + kc / k / math.exp(log_s)
-        )
+        s = math.exp(log_s)
+        return -math.expm1(-math.log1p(n * s) / n) - 1.0 / (1.0 + kc / k / s)
 
     grid = np.linspace(-20.0, 60.0, 801)
     top = grid[np.argmax([excess(x) for x in grid])]
@@ -302,9 +275,10 @@ def terms(rng: Generator, stop: float) -> list[list[float]]:
     ]
 
 
-def room(spring: Spec) -> float:
-    """Return the largest possible compressive strain of a spring, or 1."""
-    return 1.0 + spring.get("eps_star", 0.0)
+def room(spec: Spec) -> float:
+    """Return the largest possible compression of a chain; each spring's strain is at least 1."""
+    pairs = zip(spec["springs"], spec["heights"], strict=True)
+    return sum(h * (1.0 + s.get("eps_star", 0.0)) for s, h in pairs)
 
 
 def remembering(
@@ -326,7 +300,6 @@ def remembering(
         stop = bounce(spec, max(masses)) * log(rng, 1.0, 100.0)
     if drive != "impact":
         kind = rng.random()
-        most = sum(h * room(s) for s, h in zip(springs, spec["heights"], strict=True))
         if kind < 0.15:
             top = log(rng, 1e-3, 0.1)  # hardly anything snaps
         elif kind < 0.25 and drive == "displacement":
@@ -334,7 +307,7 @@ def remembering(
         else:
             top = rng.uniform(0.2, 0.75)
         at, levels = path(rng, top, int(rng.integers(1, 10)))
-        scale = most if drive == "displacement" else k0 * log(rng, 0.3, 10.0)
+        scale = room(spec) if drive == "displacement" else k0 * log(rng, 0.3, 10.0)
         floor = -math.inf if drive == "displacement" and rng.random() < 0.5 else 0.0
         spec[drive] = [at, [scale * max(level, floor) for level in levels]]
     if rng.random() < 0.4:
@@ -419,8 +392,7 @@ def known_motion(
     if rng.random() < 0.15:
         springs[-1] = dict(springs[0])
     spec = chain_of(rng, springs, log(rng, 3e-4, 2e-2), [0.0] * count)
-    most = sum(h * room(s) for s, h in zip(springs, spec["heights"], strict=True))
-    samples = int(rng.choice([11, 31, 61]))
+    most, samples = room(spec), int(rng.choice([11, 31, 61]))
     ratio = 10.0 ** float(rng.choice([0.0, 2.0, 5.0, 8.0]))
     steps = ratio ** rng.random(samples - 1)
     at, levels = path(rng, rng.uniform(0.1, 0.75), int(rng.integers(1, 8)))

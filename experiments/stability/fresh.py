@@ -15,6 +15,7 @@ import math
 import sys
 import time
 import warnings
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -107,11 +108,10 @@ def slope_bar(rtol: float) -> float:
 
 def slope_error(spec: Spec, scene: Scene, rtol: float, most: int, known: dict[str, Any]) -> float:
     """Return the largest error of the solver's derivatives over their range; NaN if unjudged."""
-    names = spec.get("sensitivities", [])
+    names, worst = spec.get("sensitivities", []), math.nan
     if not names:
-        return math.nan
+        return worst
     answer = ff.simulate(*scene, rtol=rtol, sensitivities=names)
-    worst = math.nan
     for name in names:
         if name not in known:
             known[name] = slopes_of(spec, name, most)
@@ -125,8 +125,9 @@ def slope_error(spec: Spec, scene: Scene, rtol: float, most: int, known: dict[st
     return float(worst)
 
 
-SIDES = "plus", "minus"
-OF_STRESSES = 1e-14  # rounding error of the logarithm of a stress after a few switches
+# Rounding error of the logarithm of a stress after a few switches; over the spread of the snap
+# stresses it is the smallest strain error that brute force can resolve.
+OF_STRESSES = 1e-14
 REASONS = {
     "step underflow": "shrank to nothing",
     "vibration": "masses vibrate too fast",
@@ -162,18 +163,13 @@ def lines_of(
     return lines
 
 
-def finest_of(spec: Spec) -> float:
-    """Return the smallest strain error that brute force with rounded stresses can resolve."""
-    springs = spec.get("springs", [])
-    spreads = [spring.get(f"spread_{side}", 1.0) for spring in springs for side in SIDES]
-    return OF_STRESSES / min(spreads, default=1.0)
-
-
 def judged(
     spec: Spec, scene: Scene, truth: Truth, rtol: float, most: int, known: dict[str, Any]
 ) -> dict[str, Any]:
     """Compare the solver's result for a scene with the true solution: errors over rtol."""
-    finest = 0.0 if spec.get("judge") == "roots" else finest_of(spec)
+    springs, rooted = spec.get("springs", []), spec.get("judge") == "roots"
+    spreads = [s.get(f"spread_{side}", 1.0) for s in springs for side in ("plus", "minus")]
+    finest = 0.0 if rooted else OF_STRESSES / min(spreads, default=1.0)
     sure = not truth.why and max(truth.unsure, finest) <= 0.1 * rtol
     found: dict[str, Any] = {
         "judge": truth.why or ("judged" if sure else "chaotic"), "unsure": truth.unsure,
@@ -185,9 +181,8 @@ def judged(
         answer = ff.simulate(*scene, rtol=rtol)
     except ff.SimulationError as refusal:
         reason = next((key for key, part in REASONS.items() if part in str(refusal)), "other")
-        return found | {
-            "outcome": "refused", "reason": reason, "seconds": time.perf_counter() - began,
-        }  # fmt: skip
+        took = time.perf_counter() - began
+        return found | {"outcome": "refused", "reason": reason, "seconds": took}
     except Exception as wrong:  # reported; a run of hundreds of scenes continues
         return found | {"outcome": "failure", "reason": f"{type(wrong).__name__}: {wrong}"[:200]}
     found["seconds"] = time.perf_counter() - began
@@ -233,20 +228,13 @@ def summary(lines: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def wrong(lines: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of the scenes with wrong results."""
-    return lines[(lines.error > POOR) | (lines.slope > lines.rtol.map(slope_bar))]
-
-
 def write_page() -> None:
     """Write README.md from the stored scenes."""
     lines = pd.read_csv(KEPT)
     lines["reason"] = lines.reason.fillna("")
     table, plain = summary(lines), set(FAMILIES) - {*MEMORY, *REMEMBERING}
-    tables = {
-        name: studies.shown(table[table.family.isin(families)], 2)
-        for name, families in (("fresh", plain), ("memory", MEMORY), ("worn", REMEMBERING))
-    }
+    parts = {"fresh": plain, "memory": MEMORY, "worn": REMEMBERING}
+    tables = {n: studies.shown(table[table.family.isin(own)], 2) for n, own in parts.items()}
     worn = lines[lines.family.isin(REMEMBERING)]
     studies.write_page(
         HERE, **tables, fresh_scenes=lines.scene.nunique(), fresh_seed=SEED,
@@ -256,35 +244,25 @@ def write_page() -> None:
     )  # fmt: skip
 
 
-def compile_all(families: tuple[str, ...]) -> None:
-    """Run a few scenes of each family, so that no timed scene compiles."""
-    for family in families:
-        for number in range(6):
-            scene = scene_from(spec_of(family, number))
-            with contextlib.suppress(ff.SimulationError):
-                ff.simulate(*scene)
-
-
 def main() -> None:
     """Run the command line."""
     warnings.simplefilter("ignore")
-    ask = studies.arguments(
-        __doc__, scenes=(134, "per family"), first=(0, "number of the first scene")
-    )
+    numbers = {"scenes": (134, "per family"), "first": (0, "number of the first scene")}
+    ask = studies.arguments(__doc__, KEPT, **numbers)
     ask.add_argument("--family", action="append", choices=FAMILIES)
     ask.add_argument("--rtol", type=float, action="append")
-    ask.add_argument("--out", type=Path, default=KEPT)
     ask.add_argument("--processes", type=int, default=2, choices=(1, 2))
     ask.add_argument("--page", action="store_true", help="write README.md of fresh.csv")
     given = ask.parse_args()
-    rtols = tuple(given.rtol or RTOLS)
+    rtols, families = tuple(given.rtol or RTOLS), given.family or FAMILIES
     if given.page:
         write_page()
         return
-    numbers = range(given.first, given.first + given.scenes)
-    tasks = [(f, n, rtols) for f in given.family or FAMILIES for n in numbers]
+    tasks = [(f, given.first + n, rtols) for f in families for n in range(given.scenes)]
     lines: list[dict[str, Any]] = []
-    compile_all(tuple(dict.fromkeys(family for family, *_ in tasks)))
+    for family, number in product(families, range(6)):  # no timed scene must compile
+        with contextlib.suppress(ff.SimulationError):
+            ff.simulate(*scene_from(spec_of(family, number)))
     for found in studies.in_order(lines_of, [(task,) for task in tasks], given.processes):
         lines += found
         if len(lines) % (50 * len(rtols)) == 0:
@@ -294,8 +272,9 @@ def main() -> None:
     studies.write_csv(table, given.out, 6)
     with pd.option_context("display.width", 250, "display.max_columns", 30):
         print(summary(table).to_string(index=False))
+        wrong = table[(table.error > POOR) | (table.slope > table.rtol.map(slope_bar))]
         columns = ["scene", "rtol", "error", "slope", "method", "steps"]
-        print(wrong(table)[columns].to_string(index=False))
+        print(wrong[columns].to_string(index=False))
 
 
 if __name__ == "__main__":

@@ -52,15 +52,10 @@ def spring_of(point: Point) -> ff.BistableSpring:
     """Return the bistable spring of a scene."""
     sigma_a = point.k0 * point.eps_a / (1.0 - point.eps_a)
     return ff.BistableSpring(
-        k0=point.k0,
-        kc=point.kc_ratio * point.k0,
-        dsigma=point.dsigma_ratio * sigma_a,
-        eps_a=point.eps_a,
-        eps_c=point.eps_c,
-        kh_plus=point.kh_plus_ratio * point.k0,
-        kh_minus=point.kh_minus_ratio * point.k0,
-        eta=point.eta,
-    )
+        k0=point.k0, kc=point.kc_ratio * point.k0, dsigma=point.dsigma_ratio * sigma_a,
+        eps_a=point.eps_a, eps_c=point.eps_c, kh_plus=point.kh_plus_ratio * point.k0,
+        kh_minus=point.kh_minus_ratio * point.k0, eta=point.eta,
+    )  # fmt: skip
 
 
 def chain_of(point: Point) -> ff.Chain:
@@ -120,20 +115,18 @@ def scene_of(point: Point) -> Scene:
     if point.drive == "impact":
         return chain, ff.Impact(STRIKER, point.velocity), time
     strains = turns_of(point)
-    fine = np.interp(np.linspace(0, len(strains) - 1, 64 * (len(strains) - 1) + 1),
-                     np.arange(len(strains)), strains)  # fmt: skip
+    last = len(strains) - 1
+    fine = np.interp(np.linspace(0, last, 64 * last + 1), np.arange(last + 1), strains)
+    along = np.linspace(0.0, duration_of(point), len(fine))
     if point.drive == "stress":
         levels = spring_of(point).stress(fine)
         if point.kh_plus_ratio == 0.0 or point.kh_minus_ratio == 0.0:
             levels = levels * (1.0 - 1e-3)
-        along = np.linspace(0.0, duration_of(point), len(levels))
         return chain, ff.StressDrive(np.interp(time, along, levels)), time
-    along = np.linspace(0.0, duration_of(point), len(fine))
     share = 1.0
     if point.springs > 1 and point.kinds != "bistable":  # share of the linear springs excluded
         bistable = [isinstance(s, ff.BistableSpring) for s in chain.springs]
-        share = math.fsum(h for h, is_b in zip(chain.heights, bistable, strict=True) if is_b)
-        share = share / chain.height
+        share = math.fsum(np.array(chain.heights)[bistable]) / chain.height
     motion = np.interp(time, along, fine) * chain.height * share
     return chain, ff.DisplacementDrive(motion), time
 
@@ -142,11 +135,8 @@ def scene_from(spec: Spec) -> Scene:
     """Return chain, drive and samples."""
     if "point" in spec:
         return scene_of(Point(**spec["point"]))
-    springs = [
-        (ff.MicroscaleSpring if "sigma_plus" in s else
-         ff.BistableSpring if "kc" in s else ff.LinearSpring)(**s)
-        for s in spec["springs"]
-    ]  # fmt: skip
+    kinds = {"sigma_plus": ff.MicroscaleSpring, "kc": ff.BistableSpring, "k0": ff.LinearSpring}
+    springs = [next(kind for key, kind in kinds.items() if key in s)(**s) for s in spec["springs"]]
     chain = ff.Chain(springs, spec["heights"], spec["area"], spec["masses"], spec["site"])
     grid = np.linspace(0.0, spec["stop"], spec["samples"])
     if "impact" in spec:
@@ -172,33 +162,23 @@ def _or_zero(u: float, low: float, high: float, share: float) -> float:
 
 def designed(count: int, seed: int) -> list[Point]:
     """Return scenes of a Latin hypercube over all axes; most chains are short, some long."""
-    design = qmc.LatinHypercube(19, rng=seed).random(count)
     points = []
-    for u in design:
+    for u in qmc.LatinHypercube(19, rng=seed).random(count):
         springs = round(1000.0 ** (u[0] ** 7))
         samples = round(_log(u[1] ** 2, 5.0, 2e4))
-        drive = DRIVES[min(int(u[2] * 4.0), 3) % 3]  # impacts twice as often
         eps_a = _log(u[3], 0.01, 0.6)
-        point = Point(
-            drive=drive,
-            kinds=KINDS[int(u[4] * 3)],
-            history=HISTORIES[int(u[5] * len(HISTORIES))],
-            k0=_log(u[6], 1e5, 1e8),
-            kc_ratio=_log(u[7], 1.0, 1e5),
+        points.append(Point(
+            drive=DRIVES[min(int(u[2] * 4.0), 3) % 3],  # impacts twice as often
+            kinds=KINDS[int(u[4] * 3)], history=HISTORIES[int(u[5] * len(HISTORIES))],
+            k0=_log(u[6], 1e5, 1e8), kc_ratio=_log(u[7], 1.0, 1e5),
             dsigma_ratio=-min(max(1.1 * u[8] - 0.1, 0.0), 1.0) * 0.99,
             kh_plus_ratio=_or_zero(u[9], 1e-3, 100.0, 0.1),
             kh_minus_ratio=_or_zero(u[10], 1e-3, 100.0, 0.1),
-            eps_a=eps_a,
-            eps_c=eps_a + (0.95 - eps_a) * (0.05 + 0.9 * u[11]),
+            eps_a=eps_a, eps_c=eps_a + (0.95 - eps_a) * (0.05 + 0.9 * u[11]),
             mass=_or_zero(u[12], 1e-12, STRIKER, 0.5),
             top_mass=_or_zero(u[13], 1e-12, STRIKER, 0.7),
-            eta=_or_zero(u[14], 1e-6, 1e8, 0.4),
-            site_eta=_or_zero(u[15], 1e-6, 1e8, 0.6),
-            velocity=_log(u[16], 1e-3, 100.0),
-            height=_log(u[17], 1e-6, 1.0),
-            springs=springs,
-            samples=max(min(samples, 200_000 // springs), 5),
-            duration=_log(u[18], 0.1, 10.0),
-        )
-        points.append(point)
+            eta=_or_zero(u[14], 1e-6, 1e8, 0.4), site_eta=_or_zero(u[15], 1e-6, 1e8, 0.6),
+            velocity=_log(u[16], 1e-3, 100.0), height=_log(u[17], 1e-6, 1.0), springs=springs,
+            samples=max(min(samples, 200_000 // springs), 5), duration=_log(u[18], 0.1, 10.0),
+        ))  # fmt: skip
     return points
