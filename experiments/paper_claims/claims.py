@@ -93,15 +93,13 @@ def oscillation(drive: Drive, mass: float, damper: float) -> dict[str, float]:
     got, massless = driven(drive, mass, damper), driven(drive, 0.0, damper)
     w, stress, stress_0 = got.displacement[-1], got.base_stress, massless.base_stress
     return {
-        "damper": damper,
-        "stress": rms(stress - drive.stress, drive.stress),
+        "damper": damper, "stress": rms(stress - drive.stress, drive.stress),
         "largest": float(100 * np.max(abs(stress - drive.stress)) / np.max(drive.stress)),
         "displacement": rms(w - drive.displacement, drive.displacement),
         "vibration": rms(stress - stress_0, drive.stress),
         "lag": rms(stress_0 - drive.stress, drive.stress),
-        "turns": extra_turns(stress, drive.stress),
-        "turns_w": extra_turns(w, drive.displacement),
-    }
+        "turns": extra_turns(stress, drive.stress), "turns_w": extra_turns(w, drive.displacement),
+    }  # fmt: skip
 
 
 def damper_needed(drive: Drive, mass: float = OWN_MASS, share: float = TURN) -> float:
@@ -109,10 +107,8 @@ def damper_needed(drive: Drive, mass: float = OWN_MASS, share: float = TURN) -> 
 
     def calm(log_damper: float) -> bool:
         got = driven(drive, mass, math.exp(log_damper))
-        return not (
-            extra_turns(got.base_stress, drive.stress, share)
-            + extra_turns(got.displacement[-1], drive.displacement, share)
-        )
+        pairs = (got.base_stress, drive.stress), (got.displacement[-1], drive.displacement)
+        return not sum(extra_turns(*pair, share) for pair in pairs)
 
     return math.exp(least(calm, math.log(0.1), math.log(1000.0), math.log(1.01)))
 
@@ -149,12 +145,10 @@ def slowed(drive: Drive, damper: float, slower: float) -> float:
 
 def ratio_readings(name: str, eta: float | None = None) -> dict[str, float]:
     """Return ζ = η/(2 H √(ρ k)), ρ = m/(A H), of a published set by each reading."""
-    item, other = (
-        ff.published[name],
-        ff.published[MODEL_1 if name == FOAM_2 else FOAM_2].chain.height,
-    )
+    item = ff.published[name]
     s, chain, own, eta = item.bistable, item.chain, item.specimen_mass, eta or item.eta or 0.0
     whole = chain.height
+    other = ff.published[MODEL_1 if name == FOAM_2 else FOAM_2].chain.height
 
     def ratio(k: float = s.kc, mass: float = STRIKER, height: float = whole) -> float:
         return eta / (2.0 * height * math.sqrt(mass / (chain.area * height) * k))
@@ -168,9 +162,8 @@ def ratio_readings(name: str, eta: float | None = None) -> dict[str, float]:
         "k_h− (branch e) for k_c": ratio(s.kh_minus),
         "tangent of branch c at C2 for k_c": ratio((s.kc + s.sigma_c) ** 2 / s.kc),
         "tangent of branch c at C1 for k_c": ratio((s.kc + s.sigma_hat_c) ** 2 / s.kc),
-        "secant of branch c, C2 to C1, for k_c": ratio(
-            (s.sigma_hat_c - s.sigma_c) / (s.eps_hat_c - s.eps_c)
-        ),
+        "secant of branch c, C2 to C1, for k_c":
+            ratio((s.sigma_hat_c - s.sigma_c) / (s.eps_hat_c - s.eps_c)),
         "secant from zero to C1 for k_c": ratio(s.sigma_hat_c / s.eps_hat_c),
         "secant of branch c from ε_* to C1": ratio(s.sigma_hat_c / (s.eps_hat_c - s.eps_star)),
         "k_c − k₀ for k_c": ratio(s.kc - s.k0),
@@ -181,7 +174,7 @@ def ratio_readings(name: str, eta: float | None = None) -> dict[str, float]:
         "height of the other specimen": ratio(height=other),
         "other specimen's height in 2h only": ratio() * whole / other,
         "other specimen's height in ρ only": ratio() * math.sqrt(other / whole),
-    }
+    }  # fmt: skip
 
 
 def ratio_wanted() -> dict[str, float]:
@@ -268,19 +261,14 @@ def energy_row(name: str, interior: bool = True) -> dict[str, float]:
     brought = 0.5 * STRIKER * velocity**2 / chain.area
     needed = closing_velocity(name, interior)
     return {
-        "velocity": velocity,
-        "strain": float(np.max(spring_strain(chain, got))),
+        "velocity": velocity, "strain": float(np.max(spring_strain(chain, got))),
         "left": float(spring_strain(chain, got)[np.searchsorted(got.time, got.contact_end)]),
-        "c1": item.bistable.eps_hat_c,
-        "peak": float(np.max(got.base_stress)),
-        "rebound": rebound(got),
-        "needed": needed,
+        "c1": item.bistable.eps_hat_c, "peak": float(np.max(got.base_stress)),
+        "rebound": rebound(got), "needed": needed,
         "needed_energy": closing_velocity_by_energy(name),
         "excess": 100.0 * ((needed / velocity) ** 2 - 1.0),
-        "brought": brought,
-        "work": work_to_c1(name),
-        "loop": loop_area(name),
-    }
+        "brought": brought, "work": work_to_c1(name), "loop": loop_area(name),
+    }  # fmt: skip
 
 
 def lost_share(chain: ff.Chain, velocity: float) -> float:

@@ -15,38 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import claims
 import foamfit as ff
-from claims import (
-    DRIVE_VELOCITY,
-    ETA,
-    FOAM_2,
-    MODEL_1,
-    MODEL_2,
-    MODEL_3,
-    OTHER_VELOCITIES,
-    OWN_MASS,
-    SAMPLES,
-    SETS,
-    STRIKER,
-    TURN,
-    Drive,
-    damper_needed,
-    displacement_error,
-    drive_of_impact,
-    driven,
-    energy_row,
-    free_period,
-    impact_scene,
-    lost_share,
-    oscillation,
-    published_viscosity,
-    ratio_readings,
-    ratio_wanted,
-    slowed,
-    spring_strain,
-    struck,
-    vibration_by_branch,
-)
+from claims import ETA, FOAM_2, MODEL_1, MODEL_2, MODEL_3, OWN_MASS, SETS, STRIKER, Drive
 from foamfit.springs.law import BRANCH_NAMES
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -69,7 +40,7 @@ def mark(ax: Any, x: float, text: str, y: float = 0.03, dx: int = 3, **more: Any
 def draw_oscillation(drive: Drive, needed: float, path: Path) -> None:
     """Draw stress and displacement with the foam's mass, with and without damper; errors over η."""
     t = 1e3 * drive.time
-    free, damped = driven(drive, OWN_MASS, 0.0), driven(drive, OWN_MASS, needed)
+    free, damped = claims.driven(drive, OWN_MASS, 0.0), claims.driven(drive, OWN_MASS, needed)
     with studies.sheet(path, 7.0, 4.9) as figure:
         axes = figure.subplots(2, 2).ravel()
         panels = (
@@ -93,7 +64,7 @@ def draw_oscillation(drive: Drive, needed: float, path: Path) -> None:
             name = f"{BRANCH_NAMES[int(source)]}→{BRANCH_NAMES[int(target)]}"
             mark(axes[2], 1e3 * at, name, 0.02, 2)
         dampers = np.geomspace(1.0, ETA, 33)
-        rows = [oscillation(drive, OWN_MASS, damper) for damper in dampers]
+        rows = [claims.oscillation(drive, OWN_MASS, damper) for damper in dampers]
         for key, style, name in (
             ("vibration", {"color": VERMILION, "marker": "o"}, "vibration (what the mass adds)"),
             ("lag", {"color": BLUE, "marker": "s"}, "lag (what the damper does)"),
@@ -115,16 +86,14 @@ def draw_energy(path: Path) -> None:
             (axes[0], MODEL_2, "(a) foam-1 model-2, 1.75 m/s"),
             (axes[1], FOAM_2, "(b) foam-2, S2, 4.44 m/s"),
         ):
-            item, chain = ff.published[name], impact_scene(name)
-            s, got = item.bistable, struck(chain, item.striker_velocity, 4001)
+            item, chain = ff.published[name], claims.impact_scene(name)
+            s, got = item.bistable, claims.struck(chain, item.striker_velocity, 4001)
             c1 = s.eps_hat_c, s.sigma_hat_c / 1e6
-            loop = np.concatenate(
-                [np.linspace(0, c1[0], 800), np.linspace(c1[0] * (1 + 1e-9), 0, 800)]
-            )
+            loop = np.append(np.linspace(0, c1[0], 800), np.linspace(c1[0] * (1 + 1e-9), 0, 800))
             stress = s.stress(loop)
             there = stress >= 0
             ax.plot(loop[there], stress[there] / 1e6, color=GREY, lw=2.6, alpha=0.6, label="loop")
-            strain = spring_strain(chain, got)[got.time <= (got.contact_end or math.inf)]
+            strain = claims.spring_strain(chain, got)[got.time <= (got.contact_end or math.inf)]
             ax.plot(strain, s.stress(strain) / 1e6, color=VERMILION, lw=1.1, label="impact")
             ax.plot(*c1, "o", color=BLACK, ms=3.5)
             ax.annotate("C1", c1, xytext=(-6, 3), ha="right", textcoords="offset points")
@@ -136,42 +105,38 @@ def draw_energy(path: Path) -> None:
             (MODEL_1, SKY, "-"), (MODEL_2, BLUE, "--"), (MODEL_3, ORANGE, "-"),
             (FOAM_2, GREEN, "-"),
         ):  # fmt: skip
-            chain, velocity = impact_scene(name), ff.published[name].striker_velocity
-            lost = [lost_share(chain, velocity * f) for f in factors]
+            chain, velocity = claims.impact_scene(name), ff.published[name].striker_velocity
+            lost = [claims.lost_share(chain, velocity * f) for f in factors]
             ax.plot(factors, lost, color=colour, ls=style, label=name)
         mark(ax, 1.0, "published", 0.12, rotation=90)
-        ax.set(
-            xlabel="velocity over the published one (–)", ylim=(-4, 132), title="(c) energy lost"
-        )
-        ax.set(ylabel="energy lost (% of striker's)", yticks=[0, 25, 50, 75, 100])
+        ax.set(xlabel="velocity over the published one (–)", ylabel="energy lost (% of striker's)")
+        ax.set(ylim=(-4, 132), title="(c) energy lost", yticks=[0, 25, 50, 75, 100])
         ax.legend(loc="upper left", ncols=2, columnspacing=0.8, handlelength=1.2, fontsize=6.5)
 
 
 def main() -> None:
     out = studies.arguments(__doc__, HERE).parse_args().out
-    drive = drive_of_impact()
-    draw_oscillation(drive, damper_needed(drive), out / "oscillation.png")
+    drive = claims.drive_of_impact()
+    draw_oscillation(drive, claims.damper_needed(drive), out / "oscillation.png")
     draw_energy(out / "energy.png")
     values = of_oscillation() | of_literal() | of_ratios() | of_energy() | of_microscale()
-    page = subscripts(studies.write_page(HERE, out, **values))
+    page = studies.write_page(HERE, out, **values)
+    page = re.sub(r"(?<=[kε\u0302])_(h[+−]|[ac*])", r"<sub>\1</sub>", page)  # k_c, ε_a, …
     (out / "README.md").write_text(page, encoding="utf-8")
-
-
-def subscripts(text: str) -> str:
-    """Write k_c, ε_a, … with HTML subscripts."""
-    return re.sub(r"(?<=[kε\u0302])_(h[+−]|[ac*])", r"<sub>\1</sub>", text)
 
 
 def of_oscillation() -> dict[str, Any]:
     """Return numbers and table of the first claim."""
-    drive, first = drive_of_impact(MODEL_2), drive_of_impact(MODEL_1)
-    needed = damper_needed(drive)
-    free, damped = oscillation(drive, OWN_MASS, 0.0), oscillation(drive, OWN_MASS, needed)
-    fewer = driven(drive_of_impact(samples=1001), OWN_MASS, 0.0, rtol=1e-6).base_stress
-    undamped, exact = driven(drive, OWN_MASS, 0.0), driven(drive, 0.0, 0.0)
+    drive, first = claims.drive_of_impact(MODEL_2), claims.drive_of_impact(MODEL_1)
+    needed = claims.damper_needed(drive)
+    free, damped = (claims.oscillation(drive, OWN_MASS, eta) for eta in (0.0, needed))
+    coarse = claims.drive_of_impact(samples=1001)
+    fewer = claims.driven(coarse, OWN_MASS, 0.0, rtol=1e-6).base_stress
+    undamped, exact = claims.driven(drive, OWN_MASS, 0.0), claims.driven(drive, 0.0, 0.0)
     dampers = np.geomspace(0.3, 300.0, 61)
-    errors = [displacement_error(drive, OWN_MASS, damper) for damper in dampers]
+    errors = [claims.displacement_error(drive, OWN_MASS, damper) for damper in dampers]
     best = float(dampers[np.argmin(errors)])
+    cells = "{stress:.2f} | {displacement:.2f} | {vibration:.3f} | {lag:.2f} | {turns} | {turns_w}"
     rows = []
     for label, given, damper in (
         ("model-1, no damper", first, 0.0),
@@ -181,29 +146,29 @@ def of_oscillation() -> dict[str, Any]:
         ("model-2, published damper of model-3", drive, 3e2),
         ("model-2, its published damper", drive, ETA),
     ):
-        cells = (
-            "{stress:.2f} | {displacement:.2f} | {vibration:.3f} | {lag:.2f} | {turns} | {turns_w}"
-        )
-        row = cells.format(**oscillation(given, OWN_MASS, damper))
+        row = cells.format(**claims.oscillation(given, OWN_MASS, damper))
         rows.append((label, f"{float(f'{damper:.3g}'):g}", row))
-    by_mass = ratio_readings(MODEL_2, needed)["ρ = bulk density of the foam"]
-    slopes = {"": drive.spring.k0, "_c": drive.spring.kc}
+    slopes, branches = (
+        {"": drive.spring.k0, "_c": drive.spring.kc},
+        claims.vibration_by_branch(drive),
+    )
     return {
-        "velocity": DRIVE_VELOCITY, "samples": SAMPLES, "contact": 1e3 * drive.time[-1],
-        "turn": 100 * TURN, "turn_kpa": 1e-3 * TURN * float(np.ptp(drive.stress)),
-        "needed": needed, "needed_1": damper_needed(first),
-        "needed_175": damper_needed(drive_of_impact(MODEL_2, 1.75)),
-        "needed_coarse": damper_needed(drive, share=0.01),
-        "needed_ratio": by_mass,
+        "velocity": claims.DRIVE_VELOCITY, "samples": claims.SAMPLES,
+        "contact": 1e3 * drive.time[-1],
+        "turn": 100 * claims.TURN, "turn_kpa": 1e-3 * claims.TURN * float(np.ptp(drive.stress)),
+        "needed": needed, "needed_1": claims.damper_needed(first),
+        "needed_175": claims.damper_needed(claims.drive_of_impact(MODEL_2, 1.75)),
+        "needed_coarse": claims.damper_needed(drive, share=0.01),
+        "needed_ratio": claims.ratio_readings(MODEL_2, needed)["ρ = bulk density of the foam"],
         "free": free, "damped": damped, "quieter": free["vibration"] / damped["vibration"],
-        "by_branch": ", ".join(f"{k} {v:.1f} %" for k, v in vibration_by_branch(drive).items()),
+        "by_branch": ", ".join(f"{k} {v:.1f} %" for k, v in branches.items()),
         "early": 1e6 * (exact.switches[:2, 0] - undamped.switches[:2, 0]),
         "moved": float(100 * np.max(abs(undamped.base_stress[::4] - fewer)) / drive.stress.max()),
         "eta_over_needed": round(ETA / needed, -2),
-        "published_own": displacement_error(drive, OWN_MASS, ETA),
+        "published_own": claims.displacement_error(drive, OWN_MASS, ETA),
         "best": best, "at_best": min(errors), "table_oscillation": studies.lines(rows),
     } | {
-        f"period_{name}{suffix}": scale * free_period(drive, mass, slope)
+        f"period_{name}{suffix}": scale * claims.free_period(drive, mass, slope)
         for suffix, slope in slopes.items()
         for name, mass, scale in (("own", OWN_MASS, 1e6), ("striker", STRIKER, 1e3))
     }  # fmt: skip
@@ -212,22 +177,22 @@ def of_oscillation() -> dict[str, Any]:
 def of_literal() -> dict[str, Any]:
     """Numbers and tables of the second claim."""
     cases = ((0.0, 0.0), (STRIKER, 0.0), (STRIKER, ETA), (OWN_MASS, 0.0))
-    drives = {velocity: drive_of_impact(MODEL_2, velocity) for velocity in OTHER_VELOCITIES}
-    errors = {v: [displacement_error(d, *case) for case in cases] for v, d in drives.items()}
-    rows = []
-    for velocity, drive in drives.items():
-        closed = np.max(drive.displacement) / drive.height > drive.spring.eps_hat_c
-        cells = [f"{error:.1f}" for error in errors[velocity]]
-        rows.append([f"{velocity:.2f}", "yes" if closed else "no", *cells])
-    drive = drives[DRIVE_VELOCITY]
-    slow = {s: [slowed(drive, eta, s) for eta in (0.0, ETA)] for s in (1, 10, 100, 1000)}
+    drives = {v: claims.drive_of_impact(MODEL_2, v) for v in claims.OTHER_VELOCITIES}
+    errors = {v: [claims.displacement_error(d, *case) for case in cases] for v, d in drives.items()}
+    closed = {v: np.max(d.displacement) / d.height > d.spring.eps_hat_c for v, d in drives.items()}
+    rows = (
+        (f"{v:.2f}", "yes" if closed[v] else "no", *(f"{error:.1f}" for error in own))
+        for v, own in errors.items()
+    )
+    drive = drives[claims.DRIVE_VELOCITY]
+    slow = {s: [claims.slowed(drive, eta, s) for eta in (0.0, ETA)] for s in (1, 10, 100, 1000)}
     _, undamped, damped, _ = zip(*errors.values(), strict=True)
     own = [row[3] for v, row in errors.items() if v != 1.9]
     return {
-        "literal": errors[DRIVE_VELOCITY][1],
+        "literal": errors[claims.DRIVE_VELOCITY][1],
         "literal_low": min(undamped), "literal_high": max(undamped),
         "literal_damped_low": min(damped), "literal_damped_high": max(damped),
-        "literal_eta_only": displacement_error(drive, 0.0, ETA),
+        "literal_eta_only": claims.displacement_error(drive, 0.0, ETA),
         "own_low": min(own), "own_high": max(own), "own_jump": errors[1.9][3],
         "slowing": math.sqrt(STRIKER / OWN_MASS), "slow": slow[1000][1],
         "table_literal": studies.lines(rows),
@@ -237,13 +202,13 @@ def of_literal() -> dict[str, Any]:
 
 def of_ratios() -> dict[str, Any]:
     """Numbers and table of the third claim."""
-    each, wanted = {name: ratio_readings(name) for name in SETS}, ratio_wanted()
+    each, wanted = {name: claims.ratio_readings(name) for name in SETS}, claims.ratio_wanted()
     readings = {label: {name: each[name][label] for name in SETS} for label in each[MODEL_2]}
+    printed = {name: ff.published[name].damping_ratio or math.nan for name in SETS}
     off = {
-        label: {name: 100 * (row[name] / (ff.published[name].damping_ratio or math.nan) - 1)
-                for name in SETS}
+        label: {name: 100 * (row[name] / printed[name] - 1) for name in SETS}
         for label, row in readings.items()
-    }  # fmt: skip
+    }
     formula = next(iter(readings))
     nearest = min(off, key=lambda label: abs(off[label][MODEL_2]))
     return {
@@ -262,16 +227,16 @@ def of_ratios() -> dict[str, Any]:
 def of_energy() -> dict[str, Any]:
     """Numbers and tables of the fourth claim."""
     rows = {
-        "foam-1 model-1": energy_row(MODEL_1),
-        "foam-1 model-2": energy_row(MODEL_2),
-        "foam-1 model-3, S2, 5.56 mg between": energy_row(MODEL_3),
-        "foam-1 model-3, S2, massless": energy_row(MODEL_3, interior=False),
-        "foam-2, S2, 5.05 mg between": energy_row(FOAM_2),
-        "foam-2, S2, massless": energy_row(FOAM_2, interior=False),
+        "foam-1 model-1": claims.energy_row(MODEL_1),
+        "foam-1 model-2": claims.energy_row(MODEL_2),
+        "foam-1 model-3, S2, 5.56 mg between": claims.energy_row(MODEL_3),
+        "foam-1 model-3, S2, massless": claims.energy_row(MODEL_3, interior=False),
+        "foam-2, S2, 5.05 mg between": claims.energy_row(FOAM_2),
+        "foam-2, S2, massless": claims.energy_row(FOAM_2, interior=False),
     }
     massless = {label: row for label, row in rows.items() if "between" not in label}
     m2, m3, f2 = (list(rows.values())[i] for i in (1, 3, 4))
-    eta = published_viscosity()
+    eta = claims.published_viscosity()
     cells = "{velocity:.2f} | {strain:.4f} | {c1:.4f} | {mpa:.2f} | {rebound:.3f} | {needed:.4f}"
     works = "{brought:.0f} | {work:.0f} | {loop:.0f}"
     return {
