@@ -9,17 +9,17 @@ table and a figure per scene and summary.csv go to `forward/`.
     python experiments/error_vs_runtime/forward.py --scaling            # prints ns by size
 """
 
+import math
 import sys
 import textwrap
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from timeit import timeit
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -68,8 +68,7 @@ def powers(first: int, last: int) -> tuple[float, ...]:
     return tuple(10.0**-k for k in range(first, last))
 
 
-@dataclass(frozen=True)
-class Scene:
+class Scene(NamedTuple):
     """A chain under a drive, and the settings of each solver.
 
     `own` and `outside` are tolerances of foamfit and of SciPy; without the latter SciPy is left
@@ -111,52 +110,38 @@ def scenes() -> list[Scene]:
     one, two = ff.Chain([MODEL_2.bistable], [HEIGHT], AREA), MODEL_3.chain
     return [
         Scene("one_spring_impact", "one spring, impact at 2.0 m/s", one, ff.Impact(MASS, 2.0), t),
-        Scene(
-            "two_springs_mass_impact",
-            "two springs with the specimen's mass between, onsite damper, impact at 2.3 m/s", two,
-            ff.Impact(MASS, 2.3), t, outside=powers(3, 12), longest=1.0,
-        ),
-        Scene(
-            "10_springs_mass_impact",
-            "10 springs with dashpots of 2 Pa·s and 9 masses between, impact at 2.2 m/s",
-            graded(10, MODEL_2.specimen_mass, 2.0), ff.Impact(MASS, 2.2), t,
-            outside=powers(5, 11), longest=0.6,
-        ),
-        Scene(
-            "1000_springs_impact", "1000 springs, impact at 2.2 m/s", graded(1000),
-            ff.Impact(MASS, 2.2), t, own=(1e-6, 1e-10), outside=(), longest=4.0,
-        ),
-        *_with_memory(),
+        Scene("two_springs_mass_impact",
+              "two springs with the specimen's mass between, onsite damper, impact at 2.3 m/s",
+              two, ff.Impact(MASS, 2.3), t, outside=powers(3, 12), longest=1.0),
+        Scene("10_springs_mass_impact",
+              "10 springs with dashpots of 2 Pa·s and 9 masses between, impact at 2.2 m/s",
+              graded(10, MODEL_2.specimen_mass, 2.0), ff.Impact(MASS, 2.2), t,
+              outside=powers(5, 11), longest=0.6),
+        Scene("1000_springs_impact", "1000 springs, impact at 2.2 m/s", graded(1000),
+              ff.Impact(MASS, 2.2), t, own=(1e-6, 1e-10), outside=(), longest=4.0),
     ]  # fmt: skip
 
 
-def _with_memory() -> list[Scene]:
+def scenes_with_memory() -> list[Scene]:
     """Return scenes of a microscale spring like shoe foam; two of three with relaxation."""
     law = (5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77)
     height, area = 25e-3, 1.6e-3
-    plain = ff.MicroscaleSpring(*law)
-    slow = ff.MicroscaleSpring(*law, relaxation=[(0.5, 0.2)])
-    quick = ff.MicroscaleSpring(*law, relaxation=[(0.5, 0.01)])
+    plain, slow, quick = (
+        ff.MicroscaleSpring(*law, relaxation=each) for each in ((), [(0.5, 0.2)], [(0.5, 0.01)])
+    )
     struck = np.linspace(0.0, 0.08, SAMPLES)
     pressed = np.linspace(0.0, 2.0, 1280)
     motion = 0.6 * height * np.sin(np.pi * pressed) ** 2 * np.where(pressed < 1.0, 1.0, 0.8)
-    base = ff.LinearSpring(5e6)
+    on_linear = ff.Chain([ff.LinearSpring(5e6), quick], [0.2 * height, 0.8 * height], area)
     return [
-        Scene(
-            "microscale_impact", "one microscale spring, impact at 1.5 m/s",
-            ff.Chain([plain], [height], area), ff.Impact(2.0, 1.5), struck,
-        ),
-        Scene(
-            "microscale_relaxation_displacement",
-            "one microscale spring with a relaxation term, displacement drive of two cycles",
-            ff.Chain([slow], [height], area), ff.DisplacementDrive(motion), pressed, outside=(),
-        ),
-        Scene(
-            "linear_microscale_relaxation_impact",
-            "a microscale spring with a relaxation term on a linear one, impact at 1.5 m/s",
-            ff.Chain([base, quick], [0.2 * height, 0.8 * height], area), ff.Impact(2.0, 1.5),
-            struck,
-        ),
+        Scene("microscale_impact", "one microscale spring, impact at 1.5 m/s",
+              ff.Chain([plain], [height], area), ff.Impact(2.0, 1.5), struck),
+        Scene("microscale_relaxation_displacement",
+              "one microscale spring with a relaxation term, displacement drive of two cycles",
+              ff.Chain([slow], [height], area), ff.DisplacementDrive(motion), pressed, outside=()),
+        Scene("linear_microscale_relaxation_impact",
+              "a microscale spring with a relaxation term on a linear one, impact at 1.5 m/s",
+              on_linear, ff.Impact(2.0, 1.5), struck),
     ]  # fmt: skip
 
 
@@ -208,15 +193,12 @@ def reference(scene: Scene) -> Answer:
 
 def error_of(answer: Answer, truth: Answer) -> float:
     """Return the largest error over range of top displacement and base stress."""
-    worst = 0.0
-    for got, want in zip(answer, truth, strict=True):
-        miss = np.abs(got - want).max() / np.ptp(want)
-        worst = max(worst, float(miss) if np.isfinite(miss) else np.inf)
-    return worst
+    pairs = zip(answer, truth, strict=True)
+    misses = [np.abs(got - want).max() / np.ptp(want) for got, want in pairs]
+    return float(max(misses)) if np.isfinite(misses).all() else math.inf
 
 
-@dataclass
-class Timed:
+class Timed(NamedTuple):
     """A solver at one tolerance with its error, an approximate time, and its measured times."""
 
     solver: str
@@ -224,7 +206,7 @@ class Timed:
     run: Callable[[], Answer]
     error: float
     first: float
-    times: list[float] = field(default_factory=list)
+    times: list[float]
 
     def row(self) -> dict[str, Any]:
         """Return a row of the table."""
@@ -250,7 +232,7 @@ def measure(scene: Scene, budget: float) -> pd.DataFrame:
                 continue
             error = error_of(answer, truth)
             if error < 1.0:
-                timed.append(Timed(solver, tolerance, run, error, first))
+                timed.append(Timed(solver, tolerance, run, error, first, []))
             if first > scene.longest:
                 break
     take_turns(timed, budget)
@@ -262,8 +244,7 @@ def take_turns(timed: list[Timed], budget: float) -> None:
     share = budget / len(timed)
     for turn, one in product(range(ROUNDS), timed):
         together = max(1, round(SHORTEST / one.first))
-        count = min(max(round(share / (one.first * together)), 3), ROUNDS)
-        count = count if one.first < SLOW else 0
+        count = min(max(round(share / (one.first * together)), 3), ROUNDS) * (one.first < SLOW)
         if (turn + 1) * count // ROUNDS > turn * count // ROUNDS:
             if one.first < BRIEF:  # the previous run has displaced the caches
                 one.run()
@@ -338,7 +319,7 @@ def main() -> None:
     if options.scaling:
         print(studies.shown(scaling()))
         return
-    folder, wanted = options.out / "forward", scenes()
+    folder, wanted = options.out / "forward", [*scenes(), *scenes_with_memory()]
     wanted = [scene for scene in wanted if scene.name in (options.scenes or [scene.name])]
     folder.mkdir(parents=True, exist_ok=True)
     rows, figures = [], []

@@ -29,29 +29,21 @@ class Impact:
             law.A: [(row[law.EPS_A], law.D), (0.0, FREE)],
             law.D: [(row[law.HAT_C], law.C), (row[law.EPS_A], law.A)],
             law.C: [(row[law.EPS_C], law.E)],
-            law.E: [
-                (row[law.EPS_C], law.C),
-                (row[law.EPS_C] - row[law.SIG_C] / row[law.DOWN], FREE),
-                (row[law.HAT_A], law.A),
-            ],
-        }
+            law.E: [(row[law.EPS_C], law.C), (row[law.HAT_A], law.A),
+                    (row[law.EPS_C] - row[law.SIG_C] / row[law.DOWN], FREE)],
+        }  # fmt: skip
         w, v = hy.make_vars("w", "v")
         push = -chain.area / drive.mass
         self.integrators, self.beyond = {}, dict[int, list[int]]()
         for branch, own in ends.items():
             known = [(at, to) for at, to in own if at > -math.inf]
             self.beyond[branch] = [to for _, to in known]
+            ways = ("positive" if to in (law.D, law.C) else "negative" for _, to in known)
+            ways = [getattr(hy.event_direction, way) for way in ways]
             self.integrators[branch] = hy.taylor_adaptive(
                 [(w, v), (v, push * self.stress(branch, w / self.height))], [0.0, 0.0], tol=tol,
-                t_events=[
-                    hy.t_event(
-                        w / self.height - at,
-                        direction=getattr(
-                            hy.event_direction, "positive" if to in (law.D, law.C) else "negative"
-                        ),
-                    )
-                    for at, to in known
-                ],
+                t_events=[hy.t_event(w / self.height - at, direction=way)
+                          for (at, _), way in zip(known, ways, strict=True)],
             )  # fmt: skip
 
     def stress(self, branch: int, eps: Any) -> Any:
