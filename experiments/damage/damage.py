@@ -7,7 +7,9 @@ Method and answer: README.md. Also written: twins.csv, lattice.csv and lattice.p
 
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -28,21 +30,17 @@ SHARES = ("start_strain", "misfit_stress_strain")
 LATTICE_CYCLES = (1, 2, 10, 100, 1000)
 
 
-def fit_twins(folder: Path) -> pd.DataFrame:
-    """Return one row per specimen and cycle."""
-    rows = []
-    for name in records.HEELS:
-        found = ff.fit_cycles(records.place(name, folder), intervals="local", **MODEL)
-        rows.append(by_cycle(name, found))
-        print(name, len(found.results), "cycles", file=sys.stderr)
-    return pd.concat(rows, ignore_index=True)
-
-
-def by_cycle(name: str, found: ff.CycleFits) -> pd.DataFrame:
-    """Return the table of a specimen, with its name first."""
-    table = found.by_cycle.reset_index()
-    table.insert(0, "specimen", name)
-    return table
+def fitted(
+    names: Sequence[str], folder: Path, **options: Any
+) -> tuple[pd.DataFrame, dict[str, ff.CycleFits]]:
+    """Fit the cycles of some specimens; return one row per specimen and cycle, and the fits."""
+    found = {}
+    for name in names:
+        path = records.place(name, folder)
+        found[name] = ff.fit_cycles(path, intervals="local", **MODEL, **options)
+        print(name, len(found[name].results), "cycles", file=sys.stderr)
+    tables = {name: one.by_cycle.reset_index() for name, one in found.items()}
+    return pd.concat(tables, names=["specimen", None]).reset_index("specimen"), found
 
 
 def twin_table(table: pd.DataFrame) -> str:
@@ -93,17 +91,6 @@ def twin_changes(table: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def fit_lattices(folder: Path) -> tuple[pd.DataFrame, dict[str, ff.CycleFits]]:
-    found = {
-        name: ff.fit_cycles(
-            records.place(name, folder), cycles=LATTICE_CYCLES, intervals="local", **MODEL
-        )
-        for name in records.LATTICES
-    }
-    tables = [by_cycle(name, one) for name, one in found.items()]
-    return pd.concat(tables, ignore_index=True), found
-
-
 def lattice_table(table: pd.DataFrame) -> str:
     head = "lattice | cycle | start strain | peak stress (kPa) | dissipated (kJ/m³) | misfit"
     rows = (
@@ -115,15 +102,12 @@ def lattice_table(table: pd.DataFrame) -> str:
 
 
 def lattice_changes(table: pd.DataFrame) -> str:
-    lines = []
-    for first, last in ((1, 2), (2, 1000)):
-        columns = ("peak_stress", "dissipated_energy")
-        peak, loss = (changed(table, column, first, last)[0] for column in columns)
-        lines.append(
-            f"- From cycle {first} to {last} the peak stress changes by a factor of {peak:.2f}, "
-            f"the dissipated energy by {loss:.2f} (mean of three lattices)."
-        )
-    return "\n".join(lines)
+    return "\n".join(
+        f"- From cycle {first} to {last} the peak stress changes by a factor of "
+        f"{changed(table, 'peak_stress', first, last)[0]:.2f}, the dissipated energy by "
+        f"{changed(table, 'dissipated_energy', first, last)[0]:.2f} (mean of three lattices)."
+        for first, last in ((1, 2), (2, 1000))
+    )
 
 
 def draw_lattices(found: dict[str, ff.CycleFits]) -> None:
@@ -143,8 +127,8 @@ def main() -> None:
     studies.arguments(__doc__).parse_args()
     studies.measurements("shoe-foam-twins", "lattice-cycles")
     with studies.workplace() as folder:
-        lattices, found = fit_lattices(folder)
-        twins = fit_twins(folder)
+        lattices, found = fitted(records.LATTICES, folder, cycles=LATTICE_CYCLES)
+        twins, _ = fitted(records.HEELS, folder)
     studies.write_csv(twins, HERE / "twins.csv", 6)
     studies.write_csv(lattices, HERE / "lattice.csv", 6)
     draw_lattices(found)
