@@ -33,9 +33,8 @@ FIRST, LATER = 1, 5  # cycles with tables on the page
 # A single test cannot separate kc and eps_star (r = 1.00), but the evidence of all ten favours one
 # common eps_star. It is fitted to all tests and fixed in the groups, so that kc can be compared.
 HELD = "s1_eps_star"
-SCATTERING = tuple(
-    f"s1_{name}" for name in (*studies.MICROSCALE, "g1", "tau1") if f"s1_{name}" != HELD
-)
+SCATTERING = [f"s1_{name}" for name in (*studies.MICROSCALE, "g1", "tau1")]
+SCATTERING.remove(HELD)
 ENERGY, PEAK = "dissipated energy", "peak stress"
 UNITS = {ENERGY: (1e3, "kJ/m³"), PEAK: (1e3, "kPa")}
 LEVEL = 0.05  # significance level, for all comparisons of a cycle together
@@ -52,15 +51,12 @@ def measure(folder: Path) -> None:
 
 
 def fit_together(folder: Path, cycle: int) -> dict[str, dict[str, Any]]:
-    """Fit one cycle of all, new and worn specimens jointly; return each joint.json."""
-    found = {"all": fit_study(folder, "*", cycle, "auto")}
-    held = found["all"]["parameters"][HELD]
+    """Fit one cycle of all, then of new and of worn specimens jointly; return their joint.json."""
+    held = fit_study(folder, "*", cycle, "auto")["parameters"][HELD]
     if held["kind"] != "shared":
         sys.exit(f"cycle {cycle}: the evidence is for {HELD} {held['kind']}, not shared")
-    for group in GROUPS:
-        found[group] = fit_study(folder, group, cycle, held["value"])
     print(f"cycle {cycle} together", flush=True)
-    return found
+    return {group: fit_study(folder, group, cycle, held["value"]) for group in GROUPS}
 
 
 def fit_study(folder: Path, group: str, cycle: int, held: str | float) -> dict[str, Any]:
@@ -147,31 +143,12 @@ def counted_together(changes: pd.DataFrame) -> pd.DataFrame:
 
 def wear(found: Mapping[str, Mapping[str, Any]], measured: Loops) -> pd.DataFrame:
     """Compare the joint fits of two groups, and their measured loops."""
-    measures = {  # of the strain and stress of a loop
-        ENERGY: lambda strain, stress: float(np.trapezoid(stress, strain)),
-        PEAK: lambda strain, stress: float(stress.max()),
+    pairs = {
+        ENERGY: [Group.of([np.trapezoid(s, e) for e, s in measured[g]]) for g in GROUPS],
+        PEAK: [Group.of([stress.max() for _, stress in measured[g]]) for g in GROUPS],
     }
-    rows = [
-        change_of(name, *(Group.of([one(*loop) for loop in measured[g]]) for g in GROUPS))
-        for name, one in measures.items()
-    ]
-    for name in SCATTERING:
-        new, worn = (Group.of_joint(found[group]["parameters"][name]) for group in GROUPS)
-        rows.append(change_of(name, new, worn))
-    return counted_together(pd.DataFrame(rows))
-
-
-def shown_change(one: Any) -> str:
-    """Return a change with its 95 % interval as text."""
-    ends = 100.0 * one.change, 100.0 * one.change_lo, 100.0 * one.change_hi
-    return "{:+.0f} % ({:+.0f} to {:+.0f} %)".format(*ends).replace("-", "−")
-
-
-def verdict(one: Any) -> str:
-    """Return whether a change is significant against the scatter between specimens."""
-    if one.p_adjusted < LEVEL:
-        return "significant"
-    return f"a hint, p = {significant(one.p, 1)}" if one.p < LEVEL else "within scatter"
+    pairs |= {n: [Group.of_joint(found[g]["parameters"][n]) for g in GROUPS] for n in SCATTERING}
+    return counted_together(pd.DataFrame([change_of(n, *pair) for n, pair in pairs.items()]))
 
 
 def draw(changes: pd.DataFrame, measured: Loops, path: Path) -> None:
@@ -179,11 +156,12 @@ def draw(changes: pd.DataFrame, measured: Loops, path: Path) -> None:
     with studies.sheet(path, 7.4, 3.4) as figure:
         left, right = figure.subplots(1, 2)
         for group, colour in COLOURS.items():
-            strain, stress, spread = mean_loop(measured[group])
+            strain, *stresses = mean_loop(measured[group])
+            stress, spread = (one / 1e3 for one in stresses)
             for part in (slice(None, POINTS), slice(POINTS, None)):
-                low, high = ((stress + sign * spread)[part] / 1e3 for sign in (-1.0, 1.0))
-                left.fill_between(strain[part], low, high, color=colour, alpha=0.15, linewidth=0)
-            left.plot(strain, stress / 1e3, color=colour, linewidth=1.2, label=group)
+                ends = (stress - spread)[part], (stress + spread)[part]
+                left.fill_between(strain[part], *ends, color=colour, alpha=0.15, linewidth=0)
+            left.plot(strain, stress, color=colour, linewidth=1.2, label=group)
         left.set(xlabel="strain (–)", ylabel="stress (kPa)", title="mean loops ± deviation")
         left.legend(loc="upper left")
         order = list(changes[changes["cycle"] == FIRST]["quantity"])[::-1]
@@ -198,9 +176,8 @@ def draw(changes: pd.DataFrame, measured: Loops, path: Path) -> None:
         right.set_yticks(range(len(order)), [name.removeprefix("s1_") for name in order])
         right.set(xlabel="worn over new, less one (%)", title="changes with 95 % intervals")
         right.legend(loc="upper right")
-        figure.suptitle(
-            f"Running-shoe foam, new heel against worn. {SOURCE}", x=0.01, ha="left", fontsize=8
-        )
+        title = f"Running-shoe foam, new heel against worn. {SOURCE}"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=8)
 
 
 def change_rows(changes: pd.DataFrame) -> str:
@@ -214,9 +191,11 @@ def change_rows(changes: pd.DataFrame) -> str:
             value, low, high = (significant(end / factor, 3) for end in ends)
             yield f"{value} ({low} to {high})"
             yield percent(getattr(one, f"{group}_spread"))
-        yield shown_change(one)
+        ends = 100.0 * one.change, 100.0 * one.change_lo, 100.0 * one.change_hi
+        yield "{:+.0f} % ({:+.0f} to {:+.0f} %)".format(*ends).replace("-", "−")
         yield from (significant(x, 2) for x in (one.change_over_spread, one.p, one.p_adjusted))
-        yield verdict(one)
+        hint = f"a hint, p = {significant(one.p, 1)}" if one.p < LEVEL else "within scatter"
+        yield "significant" if one.p_adjusted < LEVEL else hint
 
     return studies.lines(cells(one) for one in changes.itertuples())
 
