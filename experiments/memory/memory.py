@@ -33,14 +33,10 @@ FIRST, HISTORY, PREDICTED = "first cycle", "cycles 1 to 3", "predicted"
 CHOSEN = [f"new-heel-comp-{i}" for i in (1, 2, 4, 5)]
 BARS = {FIRST: (0.56, 0.75), HISTORY: (0.90, 1.10), PREDICTED: (1.0, 1.25)}  # mean, worst, %
 # Columns of motion and force in the files that are searched for partial unloading.
-MOTIONS = (
-    "Gap (um)", "Position(Linear:Position) (mm)", "displacement_m", "Strain",
-    "engineering_strain",
-)  # fmt: skip
-FORCES = (
-    "Normal force (N)", "Force(Linear:Load) (kN)", "force_N", "specific_force_N_per_kg",
-    "Stress (MPa)", "engineering_stress_MPa",
-)  # fmt: skip
+MOTIONS = ("Gap (um)", "Position(Linear:Position) (mm)", "displacement_m", "Strain",
+           "engineering_strain")  # fmt: skip
+FORCES = ("Normal force (N)", "Force(Linear:Load) (kN)", "force_N", "specific_force_N_per_kg",
+          "Stress (MPa)", "engineering_stress_MPa")  # fmt: skip
 LOADED, WHOLE = 0.05, 0.35  # minimum shares of the largest force and of the motion
 MEMORY: dict[str, Any] = {"model": "microscale", "stiffening": True, "mullins": True}
 
@@ -78,12 +74,6 @@ def turned_back(data: Path) -> Iterator[dict[str, Any]]:
             back = max(back, float(np.max(np.maximum.accumulate(way) - way, initial=0.0)))
         yield {"folder": file.parent.name, "record": file.stem, "ways": len(ends) - 1,
                "back": back, "noise": noise_level(w)}  # fmt: skip
-
-
-def turned_back_table(table: pd.DataFrame) -> str:
-    made = table.groupby("folder").agg({"record": "count", "ways": "sum", "back": "max"})
-    rows = ([name, n, ways, f"{100.0 * back:.1g} %"] for name, n, ways, back in made.itertuples())
-    return studies.markdown("folder | records | loadings, unloadings | most taken back", rows)
 
 
 def study() -> None:
@@ -144,10 +134,8 @@ def draw(later: ff.Prediction, path: Path) -> None:
             ax.set(title=title, xlabel="strain (–)")
             ax.legend(loc="upper left")
         axes[0].set_ylabel("stress (kPa)")
-        figure.suptitle(
-            f"{SHOWN}, one set of parameters; measured: {SOURCE}",
-            x=0.012, ha="left", fontsize=8.0,
-        )  # fmt: skip
+        title = f"{SHOWN}, one set of parameters; measured: {SOURCE}"
+        figure.suptitle(title, x=0.012, ha="left", fontsize=8.0)
 
 
 def summary(table: pd.DataFrame) -> str:
@@ -207,14 +195,18 @@ def main() -> None:
         data = studies.measurements("shoe-foam", "shoe-foam-twins")
         studies.write_csv(turned_back(data), BACK)
         study()
-    table, values = pd.read_csv(TABLE), pd.read_csv(PARAMETERS)
+    table, values, back = (pd.read_csv(one) for one in (TABLE, PARAMETERS, BACK))
+    back = back.groupby("folder").agg({"record": "count", "ways": "sum", "back": "max"})
+    back["back"] = back["back"].map(lambda share: f"{100.0 * share:.1g} %")
     took = table[table["what"] == HISTORY]["seconds"].dropna()
     studies.write_page(
         HERE, source=SOURCE, summary=summary(table), specimens=per_specimen(table),
         values=values_table(values), inside=coverage(table[table["what"] == PREDICTED]),
         seconds=f"{took.min():.0f} to {took.max():.0f} s, {took.mean():.0f} s on average,",
         verified=coverage(table[(table["what"] == PREDICTED) & ~table["test"].isin(CHOSEN)]),
-        back=turned_back_table(pd.read_csv(BACK)),
+        back=studies.markdown(
+            "folder | records | loadings, unloadings | most taken back", back.itertuples()
+        ),
     )  # fmt: skip
 
 
