@@ -9,6 +9,7 @@ Method and answer: README.md, which 225 draws of each class (a minute) write.
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -56,32 +57,20 @@ def smooth(function: Callable[[np.ndarray], np.ndarray]) -> Motion:
     return Motion(lambda t: (function(t) - low) / size, turns)
 
 
-def triangle(rng: np.random.Generator) -> Motion:
-    return straight([0.0, rng.uniform(0.4, 0.6), 1.0], [0.0, 1.0, rng.uniform(0.0, 0.1)])
-
-
-def asymmetric(rng: np.random.Generator) -> Motion:
-    turn = rng.choice([rng.uniform(0.08, 0.4), rng.uniform(0.6, 0.92)])
-    return straight([0.0, turn, 1.0], [0.0, 1.0, 0.0])
-
-
-def sine(rng: np.random.Generator) -> Motion:
-    end = rng.uniform(0.8, 1.0)
+def half_sine(end: float) -> Motion:
     return smooth(lambda t: np.sin(np.pi * end * t))
 
 
-def haversine(rng: np.random.Generator) -> Motion:
-    turn = rng.uniform(0.45, 0.55)
+def haversine(turn: float) -> Motion:
     return smooth(lambda t: 0.5 - 0.5 * np.cos(np.pi * t / turn))
 
 
-def trapezoid(rng: np.random.Generator) -> Motion:
-    start, hold = rng.uniform(0.35, 0.45), rng.uniform(0.02, 0.2)
+def trapezoid(start: float, hold: float) -> Motion:
     return straight([0.0, start, start + hold, 1.0], [0.0, 1.0, 1.0, 0.0])
 
 
-def slow_start(rng: np.random.Generator) -> Motion:
-    ramp, turn = rng.uniform(0.01, 0.1), rng.uniform(0.4, 0.6)
+def slow_start(ramp: float, turn: float) -> Motion:
+    """Return a triangle whose speed grows from zero along the ramp."""
 
     def up(t: np.ndarray) -> np.ndarray:
         return np.where(t < ramp, t**2 / (2.0 * ramp), t - 0.5 * ramp)
@@ -119,19 +108,17 @@ def random_smooth(rng: np.random.Generator) -> Motion:
     return smooth(at)
 
 
-CLASSES = {
-    "triangle": triangle, "unequal speeds": asymmetric, "half sine": sine, "haversine": haversine,
-    "trapezoid": trapezoid, "slow start": slow_start, "inner loop": inner_loop,
-    "random smooth": random_smooth,
+CLASSES: dict[str, Callable[[np.random.Generator], Motion]] = {
+    "triangle": lambda rng: straight(
+        [0.0, rng.uniform(0.4, 0.6), 1.0], [0.0, 1.0, rng.uniform(0.0, 0.1)]),
+    "unequal speeds": lambda rng: straight(
+        [0.0, rng.choice([rng.uniform(0.08, 0.4), rng.uniform(0.6, 0.92)]), 1.0], [0.0, 1.0, 0.0]),
+    "half sine": lambda rng: half_sine(rng.uniform(0.8, 1.0)),
+    "haversine": lambda rng: haversine(rng.uniform(0.45, 0.55)),
+    "trapezoid": lambda rng: trapezoid(rng.uniform(0.35, 0.45), rng.uniform(0.02, 0.2)),
+    "slow start": lambda rng: slow_start(rng.uniform(0.01, 0.1), rng.uniform(0.4, 0.6)),
+    "inner loop": inner_loop, "random smooth": random_smooth,
 }  # fmt: skip
-
-
-def sampled(rng: np.random.Generator, rows: int) -> np.ndarray:
-    """Return sample times: even, or uneven by up to a third of a step."""
-    t = np.linspace(0.0, 1.0, rows)
-    if rng.random() < 0.3:
-        t[1:-1] += rng.uniform(-0.33, 0.33, rows - 2) / rows
-    return t
 
 
 def matched(motion: Motion, turns: np.ndarray) -> list[tuple[int, int]]:
@@ -150,8 +137,9 @@ def matched(motion: Motion, turns: np.ndarray) -> list[tuple[int, int]]:
 
 def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterator[dict]:
     """Smooth one noisy motion; yield a row for it and one for each true turning point."""
-    motion = CLASSES[name](rng)
-    t = sampled(rng, rows)
+    motion, t = CLASSES[name](rng), np.linspace(0.0, 1.0, rows)
+    if rng.random() < 0.3:  # uneven sampling
+        t[1:-1] += rng.uniform(-0.33, 0.33, rows - 2) / rows
     true = motion.at(t)
     noisy = true + noise * rng.standard_normal(rows)
     found, seconds = studies.timed(follow, t, noisy, NoiseLevel(noise, True, ""))
@@ -209,23 +197,16 @@ def table(data: pd.DataFrame, by: str) -> pd.DataFrame:
     def rms(values: pd.Series) -> float:
         return float(np.sqrt(np.mean(values**2)))
 
-    columns = {
-        "draws": m.size(),
-        "RMS (σ)": m.rms.mean() ** 0.5,
-        "RMS near turns (σ)": m.near.mean() ** 0.5,
-        "worst (σ)": m.worst.max(),
-        "held (%)": 100.0 * m.held.mean(),
-        "held near turns (%)": 100.0 * m.held_near.mean(),
-        "height: bias (σ)": f.height.mean(),
-        "height: RMS (σ)": f.height.apply(rms),
-        "height held (%)": f.height_z.apply(held),
-        "instant: RMS (samples)": f.late.apply(rms),
+    return pd.DataFrame({
+        "draws": m.size(), "RMS (σ)": m.rms.mean() ** 0.5,
+        "RMS near turns (σ)": m.near.mean() ** 0.5, "worst (σ)": m.worst.max(),
+        "held (%)": 100.0 * m.held.mean(), "held near turns (%)": 100.0 * m.held_near.mean(),
+        "height: bias (σ)": f.height.mean(), "height: RMS (σ)": f.height.apply(rms),
+        "height held (%)": f.height_z.apply(held), "instant: RMS (samples)": f.late.apply(rms),
         "false turns (%)": 100.0 * m.invented.apply(lambda v: np.mean(v > 0)),
-        "largest reversal (σ)": m.back.max(),
-        "modes": m.modes.median(),
+        "largest reversal (σ)": m.back.max(), "modes": m.modes.median(),
         "median time (ms)": m.ms.median(),
-    }
-    return pd.DataFrame(columns)
+    })  # fmt: skip
 
 
 def found_by_size(data: pd.DataFrame) -> pd.DataFrame:
@@ -236,25 +217,19 @@ def found_by_size(data: pd.DataFrame) -> pd.DataFrame:
     shows = pd.cut(turns["size"] * turns.samples**0.5, [0, 5, 10, 15, 20, 30, 1e9], labels=names)
     long = turns.samples.gt(3.0).map({True: "of 3 samples and more", False: "of fewer"})
     seen = turns.found.astype(float)
-    out = seen.groupby([shows, long], observed=True).agg(["mean", "size"]).unstack()
-    out.columns = [f"{kind}: {'found (%)' if what == 'mean' else 'turns'}" for what, kind in out]
-    share = [column for column in out if "found" in column]
-    out[share] *= 100.0
+    counts = {"found (%)": lambda share: 100.0 * share.mean(), "turns": "size"}
+    out = seen.groupby([shows, long], observed=True).agg(**counts).unstack()
+    out.columns = [f"{kind}: {what}" for what, kind in out]
     return out.rename_axis(index="drop (σ) × √samples")
 
 
 def main() -> None:
     parser = studies.arguments(__doc__, draws=(25, "of each class, rows and noise"), seed=0)
     options = parser.parse_args()
+    cases = product(enumerate(CLASSES), ROWS, enumerate(NOISE), range(options.draws))
     data = pd.DataFrame(
-        row
-        for k, name in enumerate(CLASSES)
-        for n in ROWS
-        for i, noise in enumerate(NOISE)
-        for draw in range(options.draws)
-        for row in one(
-            name, n, noise, np.random.default_rng([options.seed, k, n, i, draw]),
-        )
+        row for (k, name), n, (i, noise), draw in cases
+        for row in one(name, n, noise, np.random.default_rng([options.seed, k, n, i, draw]))
     )  # fmt: skip
     sigma = data[data.what == "motion"].sigma
     percents = (100.0 * data.noise).round(3).astype(str)
@@ -262,13 +237,12 @@ def main() -> None:
     tables = {"classes": table(data, "class"), "cells": table(data, "cell")}
     tables["found"] = found_by_size(data)
     values = {name: studies.shown(one.astype(float).reset_index()) for name, one in tables.items()}
-    values |= {
-        "draws": str(options.draws * len(ROWS) * len(NOISE)),
-        "sigma": f"{sigma.quantile(0.025):.2f} to {sigma.quantile(0.975):.2f}",
-    }  # fmt: skip
     whole = options.draws >= 25 and options.seed == 0
     with studies.workplace() as folder:
-        print(studies.write_page(HERE, HERE if whole else folder, **values))
+        print(studies.write_page(
+            HERE, HERE if whole else folder, draws=options.draws * len(ROWS) * len(NOISE),
+            sigma=f"{sigma.quantile(0.025):.2f} to {sigma.quantile(0.975):.2f}", **values,
+        ))  # fmt: skip
 
 
 if __name__ == "__main__":
