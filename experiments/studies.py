@@ -42,10 +42,13 @@ VERMILION, ORANGE, GREEN, PURPLE = "#D55E00", "#E69F00", "#009E73", "#CC79A7"
 # ------------------------------------------------------------------------------- arguments
 
 
-def arguments(doc: str | None, out: Path | None = None, **numbers: Any) -> argparse.ArgumentParser:
+def arguments(
+    doc: str | None, out: Path | None = None, page: bool = False, **numbers: Any
+) -> argparse.ArgumentParser:
     """Make the parser of a study from its docstring, output folder and numeric options.
 
-    A numeric option is given by its default, or by default and help text.
+    A numeric option is given by its default, or by default and help text. A study with `page` can
+    write its page from its tables alone.
     """
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -53,6 +56,8 @@ def arguments(doc: str | None, out: Path | None = None, **numbers: Any) -> argpa
     for name, given in numbers.items():
         default, what = given if isinstance(given, tuple) else (given, None)
         parser.add_argument(f"--{name}", type=type(default), default=default, help=what)
+    if page:
+        parser.add_argument("--page", action="store_true", help="only write page and figures")
     if out is not None:
         parser.add_argument("--out", type=Path, default=out, help="where results are written")
     return parser

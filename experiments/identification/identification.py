@@ -5,7 +5,7 @@ when a problem was solved), runs.json (machine, settings) and figures. Without F
 foam is omitted.
 
     FOAMFIT_DATA=… python experiments/identification/identification.py    # 35 min of one core
-    python experiments/identification/identification.py --redraw          # figures and page only
+    python experiments/identification/identification.py --page            # figures and page only
 """
 
 import argparse
@@ -341,13 +341,12 @@ def summary(ends: pd.DataFrame, known: dict[str, float]) -> str:
 
 def main() -> None:
     """Run all methods, unless recorded runs are only drawn, and write figures and page."""
-    parser = studies.arguments(__doc__, HERE, budget=(3.0, "seconds of a run"), seeds=10)
+    parser = studies.arguments(__doc__, HERE, page=True, budget=(3.0, "seconds of a run"), seeds=10)
     parser.add_argument("--problems", nargs="+", choices=list(CASES), default=list(CASES))
-    parser.add_argument("--redraw", action="store_true", help="draw what was recorded")
     options = parser.parse_args()
     threadpool_limits(1)  # for all, so that processor time is elapsed time
     log, notes = options.out / "runs.csv.gz", options.out / "runs.json"
-    if not options.redraw:
+    if not options.page:
         runs, setup = run_all(options)
         studies.write_csv(runs, log, 5)
         notes.write_text(json.dumps(setup, indent=1) + "\n")

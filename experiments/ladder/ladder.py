@@ -7,7 +7,6 @@ Method and answer: README.md. Also written: structures.csv (a row for each test)
 """
 
 import sys
-import time
 from dataclasses import replace
 from itertools import count, product
 from pathlib import Path
@@ -63,12 +62,6 @@ def random_chain(rng: np.random.Generator, model: str) -> tuple[list, list[float
     return [bistable(rng, sigma_a, late=True), stiff], heights
 
 
-def quasi_static_work(springs: list, heights: list[float], stress: float) -> float:
-    """Return the quasi-static work (J) that loads a chain to a stress (Pa)."""
-    history, pairs = np.linspace(0, stress, 4000), zip(springs, heights, strict=True)
-    return sum(float(np.trapezoid(history, one.strain(history))) * h * AREA for one, h in pairs)
-
-
 def random_test(
     rng: np.random.Generator, model: str, damped: bool
 ) -> tuple[Measurement, Measurement, float, float, bool] | None:
@@ -79,7 +72,9 @@ def random_test(
         return None
     loops = {i: one for i, one in enumerate(springs) if isinstance(one, ff.BistableSpring)}
     top = rng.uniform(1.2, 2.0) * max(spring.sigma_hat_c for spring in loops.values())
-    velocity = float(np.sqrt(2 * quasi_static_work(springs, heights, top) / MASS))
+    history, pairs = np.linspace(0, top, 4000), zip(springs, heights, strict=True)
+    works = (np.trapezoid(history, one.strain(history)) * h * AREA for one, h in pairs)
+    velocity = float(np.sqrt(2 * float(sum(works)) / MASS))  # of the quasi-static work
     site = 0.0
     if damped:
         share = 10 ** rng.uniform(-1.5, -0.6)  # of the largest stress, at first contact
@@ -137,14 +132,13 @@ def climb(seed: int, kind: int, case: int) -> dict[str, Any]:
     clean, test, noise, dissipated, closed = made
     misfit = best_simpler_misfit(clean, model, damped)
     clear = closed and misfit >= CLEAR_MISFIT * noise
-    began = time.perf_counter()
-    ladder = ff.fit(test, model="auto").ladder
-    chosen, truth = ladder.chosen, name_of(model, damped)
+    result, seconds = studies.timed(ff.fit, test, model="auto")
+    chosen, truth = result.ladder.chosen, name_of(model, damped)
     return {
         "structure": truth, "case": case,
         "clear": clear and (not damped or dissipated >= CLEAR_DAMPING), "chosen": chosen.name,
-        "found": chosen.name == truth, "models tried": len(ladder.rungs),
-        "seconds": time.perf_counter() - began,
+        "found": chosen.name == truth, "models tried": len(result.ladder.rungs),
+        "seconds": seconds,
     }  # fmt: skip
 
 
@@ -159,37 +153,25 @@ def structure_table(table: pd.DataFrame) -> str:
     return studies.markdown(head, rows)
 
 
-def confusion(table: pd.DataFrame) -> str:
-    """Return the counts of chosen against true structure for all tests."""
-    counts = pd.crosstab(table["structure"], table["chosen"]).reset_index()
-    return studies.markdown(counts.columns, counts.to_numpy())
-
-
-def write_page(folder: Path) -> None:
-    """Write the page from the table in the folder."""
-    table = pd.read_csv(folder / "structures.csv")
-    clear = table[table["clear"]]
-    studies.write_page(
-        HERE, folder, samples=SAMPLES,
-        damping=100 * CLEAR_DAMPING, misfit=CLEAR_MISFIT, structures=structure_table(table),
-        found=int(clear["found"].sum()), clear=len(clear), rate=100 * clear["found"].mean(),
-        confusion=confusion(table),
-    )  # fmt: skip
-    print(structure_table(table))
-    print(f"{clear['found'].sum()} of {len(clear)} clear tests found")
-
-
 def main() -> None:
-    parser = studies.arguments(__doc__, HERE, tests=(20, "tests of each structure"), seed=2014)
-    parser.add_argument("--page", action="store_true", help="only write the page")
-    options = parser.parse_args()
+    numbers = {"tests": (20, "tests of each structure"), "seed": 2014}
+    options = studies.arguments(__doc__, HERE, page=True, **numbers).parse_args()
     if not options.page:
         ff.fit(random_test(np.random.default_rng(0), "bistable", False)[1])  # compiles
         kinds, cases = range(len(STRUCTURES)), range(1, options.tests + 1)
         jobs = ((options.seed, kind, case) for case in cases for kind in kinds)
         table = studies.said(studies.in_order(climb, jobs, 2))
         studies.write_csv(table, options.out / "structures.csv")
-    write_page(options.out)
+    table = pd.read_csv(options.out / "structures.csv")
+    clear, rows = table[table["clear"]], structure_table(table)
+    counts = pd.crosstab(table["structure"], table["chosen"]).reset_index()
+    studies.write_page(
+        HERE, options.out, samples=SAMPLES,
+        damping=100 * CLEAR_DAMPING, misfit=CLEAR_MISFIT, structures=rows,
+        found=int(clear["found"].sum()), clear=len(clear), rate=100 * clear["found"].mean(),
+        confusion=studies.markdown(counts.columns, counts.to_numpy()),
+    )  # fmt: skip
+    print(rows, f"{clear['found'].sum()} of {len(clear)} clear tests found", sep="\n")
 
 
 if __name__ == "__main__":

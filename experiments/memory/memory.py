@@ -189,9 +189,7 @@ def values_table(values: pd.DataFrame) -> str:
 
 
 def main() -> None:
-    parser = studies.arguments(__doc__)
-    parser.add_argument("--page", action="store_true", help="only write the page, from the tables")
-    if not parser.parse_args().page:
+    if not studies.arguments(__doc__, page=True).parse_args().page:
         data = studies.measurements("shoe-foam", "shoe-foam-twins")
         studies.write_csv(turned_back(data), BACK)
         study()

@@ -214,9 +214,7 @@ def write(measured: Loops) -> None:
 
 
 def main() -> None:
-    parser = studies.arguments(__doc__)
-    parser.add_argument("--page", action="store_true", help="only write picture and page")
-    options = parser.parse_args()
+    options = studies.arguments(__doc__, page=True).parse_args()
     studies.measurements("shoe-foam-twins")
     with records.placed(*records.HEELS) as folder:
         if not options.page:
