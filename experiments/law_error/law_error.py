@@ -7,12 +7,10 @@ Method and answer: README.md. Also written: law_error.csv.
 """
 
 import sys
-import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -29,8 +27,7 @@ HERE = Path(__file__).parent
 NOISE = 0.005  # of the range
 
 
-@dataclass(frozen=True)
-class Curves:
+class Curves(NamedTuple):
     """A test without noise: SI."""
 
     time: np.ndarray
@@ -74,7 +71,7 @@ def impact(width: float, rate: float, samples: int = 501) -> Curves:
         speed = np.maximum(np.abs(v), 0.01 * velocity) / velocity
         return np.interp(x / height, strain, path) * (1.0 + rate * np.log(speed))
 
-    def run(start: float, state: list[float], path: np.ndarray, end) -> object:
+    def run(start: float, state: list[float], path: np.ndarray, end: Any) -> Any:
         end.terminal, end.direction = True, -1
         return solve_ivp(
             lambda _, y: [y[1], -area * stress(y[0], y[1], path) / mass],
@@ -96,8 +93,7 @@ def impact(width: float, rate: float, samples: int = 501) -> Curves:
 def curves(kind: str) -> Curves:
     """Return the test of one kind, without noise."""
     if kind == "microscale and relaxation":
-        height, area = 10e-3, 4.6e-5
-        clock = np.linspace(0.0, 5.0, 1000)
+        height, area, clock = 10e-3, 4.6e-5, np.linspace(0.0, 5.0, 1000)
         turn, most = clock[499:501], 2e-3 * clock[499]  # the samples next to the turning point
         motion = Motion((0.0, *turn, 5.0), (0.0, most, most, 0.0), ("line",) * 3)
         foam = Microscale(5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77, relaxation=((0.5, 0.2),))
@@ -116,19 +112,14 @@ KINDS = {  # and the autocorrelation of the noise from sample to sample
 }
 
 
-def drawn(kind: str, draw: int) -> np.ndarray:
-    """Draw the noise of stress and displacement, over its standard deviation."""
-    rng, rho = np.random.default_rng([draw, list(KINDS).index(kind)]), KINDS[kind]
-    white = rng.standard_normal((2, curves(kind.split(",")[0]).time.size + 500))
-    return lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], white)[:, 500:]
-
-
 def read(kind: str, draw: int | None) -> ff.Measurement:
     """Write a test with new noise, or without noise, as files of a user, and read it."""
-    test = curves(kind.split(",")[0])
+    test, rho = curves(kind.split(",")[0]), KINDS[kind]
     stress, motion = test.stress, test.displacement
     if draw is not None:
-        one, other = drawn(kind, draw)
+        rng = np.random.default_rng([draw, list(KINDS).index(kind)])
+        white = rng.standard_normal((2, test.time.size + 500))
+        one, other = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], white)[:, 500:]
         stress = stress + NOISE * np.ptp(stress) * one
         if test.striker is not None:
             motion = motion + NOISE * np.ptp(motion) * other
@@ -144,9 +135,7 @@ def draws_of(kind: str, draws: int) -> pd.DataFrame:
     """Return a row for each parameter and draw."""
     rows, without = list[dict[str, Any]](), ff.fit(read(kind, None))
     for draw in range(draws):
-        began = time.perf_counter()
-        result = ff.fit(read(kind, draw))
-        seconds = time.perf_counter() - began
+        result, seconds = studies.timed(ff.fit, read(kind, draw))
         found = any(item["law_error"] is not None for item in result.noise.values())
         for name, item in result.parameters.items():
             if item.vary and name.startswith("s1_"):  # not of the record
@@ -176,12 +165,12 @@ def coverage(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
         }  # fmt: skip
 
 
-def summary_of(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a row for each kind."""
+def summary_of(table: pd.DataFrame) -> str:
+    """Return a Markdown row for each kind."""
     groups = table.groupby("kind", sort=False)
     holds = 100 * groups["holds"].agg(["mean", "min", "max"])
     width = groups["width over scatter"].agg(["min", "max"])
-    return pd.DataFrame({
+    summary = pd.DataFrame({
         "test": list(groups.groups), "draws": groups["draws"].max(),
         "ci95 contains the best fit without noise (%)":
             [f"{mean:.1f} ({low:.1f} to {high:.1f})" for mean, low, high in holds.to_numpy()],
@@ -190,17 +179,15 @@ def summary_of(table: pd.DataFrame) -> pd.DataFrame:
         "law error detected (%)": (100 * groups["error of the law found"].mean()).round(1),
         "median fit (s)": groups["seconds"].median().round(2),
     })  # fmt: skip
+    return studies.markdown(summary.columns, summary.to_numpy())
 
 
 def main() -> None:
     options = studies.arguments(__doc__, HERE, draws=200).parse_args()
     table = studies.said(row for kind in KINDS for row in coverage(draws_of(kind, options.draws)))
     studies.write_csv(table, options.out / "law_error.csv")
-    summary = summary_of(table)
-    studies.write_page(
-        HERE, options.out, noise=f"{100 * NOISE:g} %",
-        summary=studies.markdown(summary.columns, summary.to_numpy()),
-    )  # fmt: skip
+    noise, summary = f"{100 * NOISE:g} %", summary_of(table)
+    studies.write_page(HERE, options.out, noise=noise, summary=summary)
 
 
 if __name__ == "__main__":

@@ -58,10 +58,9 @@ def predicted(
 
 def along(test: ff.Measurement, other: ff.Measurement) -> np.ndarray:
     """Return a test's stress at the relative strains and branches of another test."""
-    at = other.displacement / other.displacement.max()
-    back = int(np.argmax(at)) + 1
-    last = float(test.stress[-1])
-    return studies.at_shares(test.displacement, test.stress, at[:back], at[back:], last)
+    at, last = other.displacement / other.displacement.max(), float(test.stress[-1])
+    parts = np.split(at, [int(np.argmax(at)) + 1])
+    return studies.at_shares(test.displacement, test.stress, *parts, last)
 
 
 def page(frame: pd.DataFrame) -> None:
@@ -69,20 +68,19 @@ def page(frame: pd.DataFrame) -> None:
     four, two = frame[frame.fitted == COUNT - 1], frame[frame.fitted == 2]
     ratio = four.half_width / four.half_width_simple
     t_alone = np.sqrt(1.0 + 1.0 / (COUNT - 1))
-    rows = (
+    rows = [
         [r.specimen, percent(r.inside, 3), f"±{percent(r.half_width)}", percent(r.inside_simple, 3),
-         f"±{percent(r.half_width_simple)}", f"{ratio[r.Index]:.2f}",
-         f"{ratio[r.Index] * t_alone:.2f}"]
-        for r in four.itertuples()
-    )  # fmt: skip
-    pairs = (
-        (r.specimen, percent(r.inside, 3), f"±{percent(r.half_width)}") for r in two.itertuples()
-    )
+         f"±{percent(r.half_width_simple)}", f"{r.half_width / r.half_width_simple:.2f}",
+         f"{r.half_width / r.half_width_simple * t_alone:.2f}"]
+        for r in (*four.itertuples(), *two.itertuples())
+    ]  # fmt: skip
     good = four[four.inside >= 0.93]
+    inside, simple = (np.average(one, weights=four.samples) for one in
+                      (four.inside, four.inside_simple))  # fmt: skip
     studies.write_page(
-        HERE, rows=studies.lines(rows), two=studies.lines(pairs),
-        inside=percent(float(np.average(four.inside, weights=four.samples)), 3),
-        simple=percent(float(np.average(four.inside_simple, weights=four.samples)), 3),
+        HERE, rows=studies.lines(rows[: len(four)]),
+        two=studies.lines(row[:3] for row in rows[len(four) :]),
+        inside=percent(float(inside), 3), simple=percent(float(simple), 3),
         median=ratio.median(), least=ratio.min(), most=ratio.max(),
         few=len(four) - len(good), count=len(four), rest=percent(good.inside.min(), 3),
     )  # fmt: skip
