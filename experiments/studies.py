@@ -111,17 +111,12 @@ def said(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
 def markdown(head: str | Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
     """Return a Markdown table; the head is a list, or names separated by "|"."""
     names = [name.strip() for name in head.split("|")] if isinstance(head, str) else list(head)
-    return "\n".join(line_of(cells) for cells in (names, ["---"] * len(names), *rows))
+    return lines([names, ["---"] * len(names), *rows])
 
 
 def lines(rows: Iterable[Iterable[Any]]) -> str:
     """Return the rows of a table whose head is in the page template."""
-    return "\n".join(map(line_of, rows))
-
-
-def line_of(cells: Iterable[Any]) -> str:
-    """Return one row of a Markdown table."""
-    return f"| {' | '.join(map(str, cells))} |"
+    return "\n".join(f"| {' | '.join(map(str, cells))} |" for cells in rows)
 
 
 def shown(frame: pd.DataFrame, digits: int = 3) -> str:

@@ -176,16 +176,12 @@ def coverage(predicted: pd.DataFrame) -> str:
 def values_table(values: pd.DataFrame) -> str:
     """Return mean and scatter between specimens of each parameter, from cycles 1 to 3."""
     own = values[values["what"] == HISTORY]
-    own = own.assign(foam=own["test"].str.rpartition("-comp")[0])
-    rows = []
-    for name, group in own.groupby("parameter", sort=False):
-        cells = []
-        for _, foam in group.groupby("foam", sort=False):
-            scatter = f" ± {foam['value'].std(ddof=1):.2g}" if len(foam) > 1 else ""
-            cells.append(f"{foam['value'].mean():.3g}{scatter}")
-        rows.append([name, *cells, studies.counted(group["state"])])
-    head = ["parameter", *own["foam"].unique(), "determined / weak / not"]
-    return studies.markdown(head, rows)
+    foam, by = own["test"].str.rpartition("-comp")[0], own["parameter"]
+    found = own["value"].groupby([by, foam], sort=False).agg(["mean", "std"])
+    scatter = found["std"].map(" ± {:.2g}".format, na_action="ignore").fillna("")
+    cells = (found["mean"].map("{:.3g}".format) + scatter).unstack(sort=False)
+    cells["determined / weak / not"] = own["state"].groupby(by, sort=False).agg(studies.counted)
+    return studies.markdown(["parameter", *cells.columns], cells.reset_index().to_numpy())
 
 
 def main() -> None:

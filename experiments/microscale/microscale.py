@@ -17,6 +17,7 @@ import foamfit as ff
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
 from cycles import Ensemble
+from studies import BLACK, BLUE, GREY, VERMILION
 
 HERE = Path(__file__).parent
 Array = NDArray[np.float64]
@@ -72,20 +73,19 @@ def rate(table: list[tuple[int, float, float]], column: int) -> float:
 
 def draw(table: list[tuple[int, float, float]], path: Path) -> None:
     """Draw loops of a few micro-springs on those of the law, and the error against n."""
-    black, blue, vermilion, grey = studies.BLACK, studies.BLUE, studies.VERMILION, studies.GREY
     with studies.sheet(path, 7.0, 3.0, 150) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.35, 1.0))
         along = history()
-        left.plot(100 * SPRING.strain(along), along / 1e3, color=black, lw=1.6, label="the law")
+        left.plot(100 * SPRING.strain(along), along / 1e3, color=BLACK, lw=1.6, label="the law")
         few = 100 * followed(SHOWN, along)
-        left.plot(few, along / 1e3, color=blue, lw=0.9, label=f"{SHOWN} micro-springs")
+        left.plot(few, along / 1e3, color=BLUE, lw=0.9, label=f"{SHOWN} micro-springs")
         left.set(xlabel="strain (%)", ylabel="stress (kPa)", title="(a) a loop with inner loops")
         left.legend(loc="upper left")
         n = np.array([row[0] for row in table])
-        for column, color, label in ((1, vermilion, "largest"), (2, blue, "RMS")):
+        for column, color, label in ((1, VERMILION, "largest"), (2, BLUE, "RMS")):
             values = [row[column] for row in table]
             right.loglog(n, values, "o-", color=color, ms=3, lw=1, label=label)
-        right.loglog(n, 0.3 * table[0][1] * n[0] / n, "--", color=grey, lw=0.8, label="1/n")
+        right.loglog(n, 0.3 * table[0][1] * n[0] / n, "--", color=GREY, lw=0.8, label="1/n")
         right.set(xlabel="micro-springs n", ylabel="difference in strain", title="(b) convergence")
         right.legend()
 
