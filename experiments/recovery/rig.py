@@ -178,13 +178,13 @@ def noisy(
     clean: dict[str, Array], ranges: dict[str, float], share: float, tau: float, seed: int
 ) -> tuple[dict[str, Array], dict[str, float]]:
     """Add independent noise to each channel; return its standard deviations too."""
-    rho, out = (tau - 1.0) / (tau + 1.0), {}
+    rho, sizes, out = (tau - 1.0) / (tau + 1.0), {name: share * ranges[name] for name in clean}, {}
     for name, values in clean.items():
         rng = np.random.default_rng([seed, 3, list(UNITS).index(name)])
         white = rng.standard_normal(len(values) + 500)
         unit = lfilter([math.sqrt(1.0 - rho * rho)], [1.0, -rho], white)[500:]
-        out[name] = values + share * ranges[name] * unit
-    return out, {name: share * ranges[name] for name in clean}
+        out[name] = values + sizes[name] * unit
+    return out, sizes
 
 
 def drawn_impact(setup: Impact, rng: np.random.Generator) -> Course:
@@ -228,13 +228,13 @@ def recorded(
     rng = np.random.default_rng([seed, 2])
     rig, lasts = course.rig, course.end
     drawn = 10 ** rng.uniform(math.log10(150), math.log10(3000))
-    slowest, fastest = 20e3 * lasts, 2e6 * lasts  # samples per second
-    samples = setup.samples or round(max(150.0, min(max(drawn, slowest), fastest)))
+    # 20 kHz to 2 MHz
+    samples = setup.samples or round(max(150.0, min(max(drawn, 20e3 * lasts), 2e6 * lasts)))
     step = float(f"{lasts / samples:.3g}") if step is None else step
     samples = round(lasts / step)
     part, after, late = rng.uniform(0.0, 0.6), rng.uniform(0.05, 0.25), rng.uniform(0.05, 0.95)
     origin = rng.uniform(-lasts, 0.0) if rng.random() < 0.5 else rng.uniform(0.0, 20.0)
-    zeros = rng.uniform(-3.0, 3.0), rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05)
+    zeros = rng.uniform((-3.0, -0.05, -0.05), (3.0, 0.05, 0.05)).tolist()
     off = rng.standard_normal()
     part = part if setup.before is None else setup.before
     first = round(part / (1.0 - part) * (1.0 + after) * samples)
@@ -254,8 +254,7 @@ def recorded(
     }
     inside = (own >= 0.0) & (own <= lasts)
     clean = {name: everything[name] for name in setup.channels}
-    own_ranges = {name: float(np.ptp(values[inside])) for name, values in clean.items()}
-    ranges = own_ranges if ranges is None else ranges
+    ranges = ranges or {name: float(np.ptp(values[inside])) for name, values in clean.items()}
     zero = round(zeros[0] * rig.height, 7) if setup.zero and not setup.trimmed else 0.0
     shifts = {"displacement": zero}
     if setup.sensor and not setup.trimmed:
@@ -266,11 +265,9 @@ def recorded(
     sd = setup.velocity_sd
     said = f"{rig.velocity * (1.0 + sd * off):.12g}" + (f" ± {sd * rig.velocity:.3g}" if sd else "")
     truth = parameters(rig.springs) | {
-        "contact_time": origin + (first - late) * step,
-        "velocity": rig.velocity,
-        "striker_mass": rig.mass,
-        "time_shift": delay,
-    }
+        "contact_time": origin + (first - late) * step, "velocity": rig.velocity,
+        "striker_mass": rig.mass, "time_shift": delay,
+    }  # fmt: skip
     if "displacement" in clean:
         truth["displacement_zero"] = zero
     time = origin + np.arange(len(own)) * step
@@ -283,20 +280,19 @@ def slow_motion(setup: Slow, peak: float, rng: np.random.Generator) -> Motion:
     at, unloading = rng.uniform(0.4, 0.8), rng.random() < 0.5
     up, down = [-gap, peak], [peak, 0.0]
     if setup.inner:
-        turns = [at * peak, (at - setup.inner) * peak]
+        low = (at - setup.inner) * peak
         if unloading:
-            turns = [max(turns[1], 0.35 * peak), max(turns[1], 0.35 * peak) + setup.inner * peak]
-            down[1:1] = turns
+            low = max(low, 0.35 * peak)
+            down[1:1] = [low, low + setup.inner * peak]
         else:
-            up[1:1] = turns
+            up[1:1] = [at * peak, low]
     levels = [*up, *([peak] if setup.motion == "trapezoid" else []), *down[1:]]
     ways = np.abs(np.diff(levels))
     ways[ways == 0.0] = 0.05 * ways.sum()
-    shapes = ["cosine" if setup.motion == "sine" else "line"] * len(ways)
-    if setup.motion == "ramp":
-        shapes[0] = "ramp"
+    rest = "cosine" if setup.motion == "sine" else "line"
+    shapes = ("ramp" if setup.motion == "ramp" else rest, *[rest] * (len(ways) - 1))
     times = np.append(0.0, np.cumsum(ways)) * DURATION / ways.sum()
-    return Motion(tuple(times.tolist()), tuple(levels), tuple(shapes))
+    return Motion(tuple(times.tolist()), tuple(levels), shapes)
 
 
 def drawn_slow(setup: Slow, rng: np.random.Generator) -> Course:

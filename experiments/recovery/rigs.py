@@ -16,6 +16,8 @@ import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,7 @@ import pandas as pd
 
 import foamfit as ff
 from foamfit.data.calibration import contradictions
-from foamfit.errors import InputError, SimulationError
+from foamfit.errors import SimulationError
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
@@ -44,32 +46,23 @@ MISSED = 1.1  # misfit over that of the true springs at which a minimum was miss
 # Wrong calibrations and faulty channels: each changes the record of a synthetic impact.
 
 
-def stated(velocity: float = 1.0, mass: float = 1.0) -> Callable[[Record], Record]:
+def stated(record: Record, velocity: float = 1.0, mass: float = 1.0) -> Record:
     """Multiply velocity and mass in the TOML."""
-
-    def changed(record: Record) -> Record:
-        said = f"{velocity * record.rig.velocity:.12g} m/s"
-        rig = replace(record.rig, mass=mass * record.rig.mass)
-        return replace(record, toml_velocity=said, rig=rig)
-
-    return changed
+    said = f"{velocity * record.rig.velocity:.12g} m/s"
+    return replace(record, toml_velocity=said, rig=replace(record.rig, mass=mass * record.rig.mass))
 
 
-def sensed(change: Callable[[Array, Array, float], Array]) -> Callable[[Record], Record]:
+def sensed(record: Record, change: Callable[[Array, Array, float], Array]) -> Record:
     """Change the force, given its samples, the time over the time under load, and its range."""
-
-    def changed(record: Record) -> Record:
-        force, lasts = record.channels["force"], record.course.end
-        since = (record.time - record.truth["contact_time"]) / lasts
-        channels = record.channels | {"force": change(force, since, float(np.ptp(force)))}
-        return replace(record, channels=channels)
-
-    return changed
+    force, lasts = record.channels["force"], record.course.end
+    since = (record.time - record.truth["contact_time"]) / lasts
+    changed = {"force": change(force, since, float(np.ptp(force)))}
+    return replace(record, channels=record.channels | changed)
 
 
-def clipped(share: float) -> Callable[[Array, Array, float], Array]:
+def clipped(force: Array, _: Array, size: float, share: float) -> Array:
     """Clip the force at a share of its range."""
-    return lambda force, _, size: np.minimum(force, np.min(force) + share * size)
+    return np.minimum(force, np.min(force) + share * size)
 
 
 def ringing(force: Array, since: Array, size: float) -> Array:
@@ -116,37 +109,38 @@ LAWS = {
 }
 SLOW = {
     f"{law}, {rows} rows, {100.0 * noise:g} %": replace(setup, rows=rows, noise=noise)
-    for law, setup in LAWS.items()
-    for rows in (300, 1000, 5000)
-    for noise in (5e-4, 1e-3, 3e-3)
+    for (law, setup), rows, noise in product(LAWS.items(), (300, 1000, 5000), (5e-4, 1e-3, 3e-3))
 } | {
     "microscale, exact motion": Slow(exact=True),
     "microscale with dashpot": Slow(dashpot=True, noise=1e-3),
     "microscale+1 with dashpot": Slow(relaxation=1, dashpot=True, noise=1e-3),
     "microscale+1, sine": Slow(relaxation=1, motion="sine", noise=1e-3),
     "microscale+1, trapezoid": Slow(relaxation=1, motion="trapezoid", noise=1e-3),
-    "microscale+1, slow start": Slow(
-        "microscale", 1, False, "ramp", noise=1e-3, early=True, zero=True
-    ),
+    "microscale+1, slow start":
+        Slow("microscale", 1, False, "ramp", noise=1e-3, early=True, zero=True),
     "microscale, unloading by 10 %": Slow(inner=0.1, noise=1e-3),
     "microscale, unloading by 3 %": Slow(inner=0.03, noise=1e-3),
     "microscale, unloading by 1 %": Slow(inner=0.01, noise=1e-3),
     "microscale, noise given": Slow(noise_given=True),
     "bistable, before contact, any zero": Slow("bistable", noise=1e-3, early=True, zero=True),
-}
+}  # fmt: skip
 FAULTS: dict[str, Callable[[Record], Record]] = {
     "nothing wrong": lambda record: record,
-    "velocity -10 %": stated(velocity=0.9),
-    "velocity +10 %": stated(velocity=1.1),
-    "mass -20 %": stated(mass=0.8),
-    "mass +25 %": stated(mass=1.25),
-    "force x 0.8": sensed(lambda force, *_: 0.8 * force),
-    "force x 1.25": sensed(lambda force, *_: 1.25 * force),
-    "clipped at 80 %": sensed(clipped(0.8)),
-    "clipped at 60 %": sensed(clipped(0.6)),
-    "drift of 5 %": sensed(lambda force, since, size: force + 0.05 * size * since),
-    "ringing, 5 %": sensed(ringing),
-    "lag of 3 %": sensed(lambda force, since, _: np.interp(since - 0.03, since, force)),
+    "velocity -10 %": partial(stated, velocity=0.9),
+    "velocity +10 %": partial(stated, velocity=1.1),
+    "mass -20 %": partial(stated, mass=0.8),
+    "mass +25 %": partial(stated, mass=1.25),
+} | {
+    name: partial(sensed, change=change)
+    for name, change in {
+        "force x 0.8": lambda force, *_: 0.8 * force,
+        "force x 1.25": lambda force, *_: 1.25 * force,
+        "clipped at 80 %": partial(clipped, share=0.8),
+        "clipped at 60 %": partial(clipped, share=0.6),
+        "drift of 5 %": lambda force, since, size: force + 0.05 * size * since,
+        "ringing, 5 %": ringing,
+        "lag of 3 %": lambda force, since, _: np.interp(since - 0.03, since, force),
+    }.items()
 }
 FAMILIES: dict[str, dict[str, Any]] = {
     "impact": IMPACTS, "slow": SLOW, "fault": FAULTS, "memory": {"three cycles": None},
@@ -170,13 +164,6 @@ def chain_of(made: Rig) -> ff.Chain:
     return ff.Chain(springs, made.heights, made.area)
 
 
-def over_truth(record: Record, test: Any, chain: ff.Chain) -> float:
-    """Return the misfit of a slow test's stress over that of the true springs."""
-    drive = ff.DisplacementDrive(test.displacement)
-    each = [ff.simulate(springs, drive, test.time) for springs in (chain, chain_of(record.rig))]
-    return float(np.divide(*[np.std(found.base_stress - test.stress) for found in each]))
-
-
 def fitted(record: Record | Cycled) -> tuple[Any, Any, dict[str, Any]]:
     """Write, read and fit a record; return test, result and estimates with a true value.
 
@@ -198,15 +185,6 @@ def fitted(record: Record | Cycled) -> tuple[Any, Any, dict[str, Any]]:
     return test, result, {a: p for a, p in result.parameters.items() if a in record.truth}
 
 
-def sentence(error: Exception) -> str:
-    """Return the message of a failed fit; for an unexpected error also its location."""
-    text = f"{type(error).__name__}: {error}"
-    if isinstance(error, InputError | SimulationError):
-        return text
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{text} ({Path(last.filename).name}:{last.lineno})"
-
-
 def judged(parameter: str, truth: float, estimate: Any) -> Row:
     """Compare an estimate with the true value."""
     low, high = map(float, estimate.ci95 or (np.nan, np.nan))
@@ -221,19 +199,25 @@ def judged(parameter: str, truth: float, estimate: Any) -> Row:
 
 def run_test(family: str, name: str, seed: int) -> list[Row]:
     """Simulate, write, read and fit one test; return a row per parameter, or for a failure."""
-    about: Row = {"family": family, "class": name, "test": seed}
-    began = time.perf_counter()
+    about, began = dict(zip(JOB, (family, name, seed), strict=True)), time.perf_counter()
     try:
         record = make(family, name, seed)
         about["rows"] = len(record.time)
         began = time.perf_counter()
         test, result, estimates = fitted(record)
     except Exception as error:
-        return [about | {"error": sentence(error), "seconds": time.perf_counter() - began}]
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        text = f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})"
+        return [about | {"error": text, "seconds": time.perf_counter() - began}]
     about |= {"status": result.status, "seconds": time.perf_counter() - began}
     if family == "slow":
-        with suppress(SimulationError):
-            about["over truth"] = over_truth(record, test, result.chain)
+        chains, drive = (
+            (result.chain, chain_of(record.rig)),
+            ff.DisplacementDrive(test.displacement),
+        )
+        with suppress(SimulationError):  # the misfit over that of the true springs
+            each = [ff.simulate(chain, drive, test.time).base_stress for chain in chains]
+            about["over truth"] = np.divide(*[np.std(stress - test.stress) for stress in each])
     about["contradicted"] = ", ".join(one.quantity for one in contradictions(test))
     found = estimates.items()
     return [about | judged(name, record.truth[name], one) for name, one in found if one.vary]
@@ -242,7 +226,7 @@ def run_test(family: str, name: str, seed: int) -> list[Row]:
 def run(jobs: list[Job], raw: Path | None, processes: int) -> pd.DataFrame:
     """Run the jobs that are not yet in `raw`, and update it after each."""
     old = pd.read_csv(raw) if raw is not None and raw.exists() else pd.DataFrame(columns=COLUMNS)
-    done = set(zip(*(old[key] for key in JOB), strict=True))
+    done = set(old[JOB].itertuples(index=False, name=None))
     left = [job for job in jobs if job not in done]
     tables = [old] if len(old) else []
     for number, more in enumerate(studies.in_order(run_test, left, processes), start=1):
@@ -251,15 +235,14 @@ def run(jobs: list[Job], raw: Path | None, processes: int) -> pd.DataFrame:
             tables[-1].to_csv(raw, mode="a", index=False, header=not raw.exists())
         print(f"\r{number} of {len(left)}", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
-    rows, asked = pd.concat(tables, ignore_index=True).infer_objects(), set(jobs)
-    return rows[[job in asked for job in zip(*(rows[key] for key in JOB), strict=True)]]
+    rows = pd.concat(tables, ignore_index=True).infer_objects()
+    return rows[pd.MultiIndex.from_frame(rows[JOB]).isin(jobs)]
 
 
 def percents(held: pd.Series) -> list[float]:
     """Return the coverage in per cent and its binomial 95 % interval."""
-    if not len(held):
-        return [np.nan] * 3
-    return [100.0 * part for part in studies.share(held.astype(bool).tolist()).values()]
+    parts = studies.share(held.astype(bool).tolist()).values() if len(held) else [np.nan] * 3
+    return [100.0 * part for part in parts]
 
 
 def coverage(rows: pd.DataFrame, by: str) -> pd.DataFrame:
@@ -312,15 +295,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="the table of classes")
     options = parser.parse_args()
     families = [options.family] if options.family else ["impact", "slow"]
-    jobs = [
-        (family, name, seed)
-        for seed in range(options.first_seed, options.first_seed + options.tests)
-        for family in families
-        for name in FAMILIES[family]
-        if re.match(options.classes, name)
-    ]
-    rows = run(jobs, options.raw, options.jobs)
-    table = tell(rows)
+    classes = [(f, name) for f in families for name in FAMILIES[f]]
+    classes = [(f, name) for f, name in classes if re.match(options.classes, name)]
+    seeds = range(options.first_seed, options.first_seed + options.tests)
+    jobs = [(*one, seed) for seed, one in product(seeds, classes)]
+    table = tell(run(jobs, options.raw, options.jobs))
     if options.out is not None:
         table.to_csv(options.out, index=False, float_format="%.4g")
     print(studies.circumstances())
