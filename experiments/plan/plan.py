@@ -9,7 +9,6 @@ Method and answer: README.md. Also written: foams.csv.gz, plan.csv and plan.png.
 
 import math
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -88,24 +87,20 @@ def judged(seed: int, springs: int) -> list[dict[str, Any]]:
         ranges = {name: sigma / first.setup.noise for name, sigma in first.noise.items()}
         path = write(first, folder, "first")
         (folder / "rig.toml").write_text(rig_toml(foam, step, first.noise), encoding="utf-8")
-        began = time.perf_counter()
-        result = ff.fit(ff.read_test(path), model=model)
-        fitted = time.perf_counter()
-        plan = ff.plan(result, rig=folder / "rig.toml")
-        planned = time.perf_counter()
-        advice = plan.advice
-        seconds = {"fit (s)": fitted - began, "plan (s)": planned - fitted}
+        result, fitting = studies.timed(ff.fit, ff.read_test(path), model=model)
+        plan, planning = studies.timed(ff.plan, result, rig=folder / "rig.toml")
+        seconds = {"fit (s)": fitting, "plan (s)": planning}
         for name, one in result.parameters.items():
             if name in plan.now:
                 rows.append(about | seconds | {"second": "none", **shown(name, one, None)})
-        best = advice.candidate if advice else None
-        tests = {
-            "advised": (best.velocity, best.mass) if best else None,
-            "strongest": (foam["fastest"], 2.0 * foam["mass"]),
-            "random": foam["random"],
-            "ideal": (1.1 * foam["closing"], foam["mass"]),
-        }
-        for number, (kind, asked) in enumerate(tests.items(), start=1):
+        best = plan.advice.candidate if plan.advice else None
+        tests = (  # as in SECOND
+            (best.velocity, best.mass) if best else None,
+            (foam["fastest"], 2.0 * foam["mass"]),
+            foam["random"],
+            (1.1 * foam["closing"], foam["mass"]),
+        )
+        for number, (kind, asked) in enumerate(zip(SECOND, tests, strict=True), start=1):
             row = about | {"second": kind}
             if asked is None:
                 rows.append(row | {"error": "no test is advised"})
@@ -117,7 +112,7 @@ def judged(seed: int, springs: int) -> list[dict[str, Any]]:
                 continue
             second = recorded(Impact(), hit[0], 1000 * number + seed, ranges, step)
             write(second, folder, f"second-{kind}")
-            expected = {} if advice is None else nearest(plan, *asked)
+            expected = nearest(plan, *asked) if best else {}
             found = together(folder, kind, model, expected)
             rows += [row | {"broke": False} | one for one in found]
     return rows
@@ -154,13 +149,11 @@ def together(
         folder / f"{kind}.toml", ["first.csv", f"second-{kind}.csv"], model,
         dict.fromkeys(expected, "shared"), name=kind,
     )  # fmt: skip
-    began = time.perf_counter()
     try:
-        found = ff.joint(study)
+        found, seconds = studies.timed(ff.joint, study)
     except (InputError, SimulationError) as error:
         yield {"error": str(error)}
         return
-    seconds = time.perf_counter() - began
     for name in expected:
         yield {"joint (s)": seconds, **shown(name, found.parameters[name], expected[name])}
 
@@ -169,9 +162,9 @@ def shown(name: str, one: Any, expected: Any) -> dict[str, Any]:
     """Return state and width of a parameter, and what was expected."""
     width = math.nan if one.ci95 is None else one.ci95[1] - one.ci95[0]
     row = {"parameter": name, "value": one.value, "state": one.state, "width": width}
-    if expected is not None:
-        row |= {"expected state": expected.state, "expected width": expected.ci95_width}
-    return row
+    if expected is None:
+        return row
+    return row | {"expected state": expected.state, "expected width": expected.ci95_width}
 
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:
@@ -251,12 +244,10 @@ def write_page(out: Path) -> None:
 def main() -> None:
     """Run the study, and write its page."""
     counts: dict[str, Any] = {"foams": (40, "foams of one spring"), "two": (20, "of two springs")}
-    parser = studies.arguments(__doc__, HERE, **counts)
-    parser.add_argument("--page", action="store_true", help="only write the page, from the tables")
-    asked = parser.parse_args()
+    asked = studies.arguments(__doc__, HERE, page=True, **counts).parse_args()
     if not asked.page:
-        jobs = [(seed + 1, 1) for seed in range(asked.foams)]
-        jobs += [(seed + 1, 2) for seed in range(asked.two)]
+        counted = ((1, asked.foams), (2, asked.two))
+        jobs = [(seed + 1, springs) for springs, foams in counted for seed in range(foams)]
         rows = list[dict[str, Any]]()
         for made in studies.in_order(judged, jobs, 2):
             rows += made
