@@ -53,15 +53,9 @@ def rows_of(test: str, law: str, result: Fit, seconds: float) -> Iterator[dict[s
             "test": test, "foam": test.rpartition("-comp")[0], "law": law,
             "misfit": result.misfit["stress_strain"],
             "agreeing": result.statistics["n_agreeing"], "seconds": seconds, "parameter": name,
-            "value": p.value, "stderr": p.stderr, "ci95_low": low,
-            "ci95_high": high, "unit": p.unit, "state": p.state,
+            "value": p.value, "stderr": p.stderr, "ci95_low": low, "ci95_high": high,
+            "unit": p.unit, "state": p.state,
         }  # fmt: skip
-
-
-def misfit_table(table: pd.DataFrame) -> str:
-    wide = table.pivot_table(index="test", columns="law", values="misfit", sort=False)[list(LAWS)]
-    rows = ([test, *(f"{100.0 * x:.2f}" for x in own)] for test, own in wide.iterrows())
-    return studies.markdown(["specimen", *LAWS], rows)
 
 
 def law_table(table: pd.DataFrame) -> str:
@@ -94,10 +88,8 @@ def draw(results: dict[str, Fit], path: Path) -> None:
     with studies.sheet(path, 7.0, 3.5, 250) as figure:
         grid = figure.add_gridspec(2, 2, width_ratios=[4.0, 2.9], height_ratios=[4.0, 1.0])
         loop, off = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
-        loop.plot(
-            strain[some], stress[some] / 1e3, "o", ms=3.6, mfc="white", mec="0.55", mew=0.6,
-            label="measured", zorder=2,
-        )  # fmt: skip
+        style = {"ms": 3.6, "mfc": "white", "mec": "0.55", "mew": 0.6, "zorder": 2}
+        loop.plot(strain[some], stress[some] / 1e3, "o", label="measured", **style)
         for law, result in results.items():
             (name, style, width), fitted = styles[law], result.curves.stress
             misfit = 100.0 * (result.misfit["stress_strain"] or 0.0)
@@ -109,10 +101,8 @@ def draw(results: dict[str, Fit], path: Path) -> None:
         off.axhline(0.0, color=GREY, lw=0.6)
         off.set(xlabel="time (s)", ylabel="residual\n(% of range)")
         _write_values(figure.add_subplot(grid[:, 1]), best)
-        figure.suptitle(
-            f"Running-shoe foam, {best.measurement.name}, first cycle", x=0.012, ha="left",
-            fontsize=8.5, weight="bold",
-        )  # fmt: skip
+        title = f"Running-shoe foam, {best.measurement.name}, first cycle"
+        figure.suptitle(title, x=0.012, ha="left", fontsize=8.5, weight="bold")
 
 
 def _write_values(side: Axes, result: Fit) -> None:
@@ -135,10 +125,8 @@ def _write_values(side: Axes, result: Fit) -> None:
         side.text(0.13, y, text, va="center", color=GREY)
         unit = "" if one.unit == "–" else f" {one.unit}"
         side.text(1.0, y, f"{one.with_error}{unit}", va="center", ha="right")
-    side.text(
-        0.0, 0.05, f"Values ± standard error. Measurement:\n{SOURCE}", va="center", color=GREY,
-        fontsize=6.5,
-    )  # fmt: skip
+    note = f"Values ± standard error. Measurement:\n{SOURCE}"
+    side.text(0.0, 0.05, note, va="center", color=GREY, fontsize=6.5)
 
 
 def main() -> None:
@@ -161,8 +149,11 @@ def main() -> None:
     table = pd.DataFrame(rows)
     studies.write_csv(table, HERE / "real_foams.csv", 6)
     draw(shown, HERE / "real_foams.png")
+    wide = table.pivot_table(index="test", columns="law", values="misfit", sort=False)[list(LAWS)]
+    cells = (100.0 * wide).map("{:.2f}".format).reset_index().to_numpy()
+    misfits = studies.markdown(["specimen", *LAWS], cells)
     studies.write_page(
-        HERE, source=SOURCE, count=len(tests), misfits=misfit_table(table), laws=law_table(table)
+        HERE, source=SOURCE, count=len(tests), misfits=misfits, laws=law_table(table)
     )
 
 
