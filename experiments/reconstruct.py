@@ -24,12 +24,7 @@ HERE = Path(__file__).parent
 NOISE, SEED = 0.01, 2014
 ROWS_BEFORE, ROWS_CONTACT, ROWS_AFTER = 50, 500, 50
 
-VELOCITIES = {
-    "foam-1/model-1": (1.75, 2.0),
-    "foam-1/model-2": (1.75, 2.0),
-    "foam-1/model-3": (1.75, 2.0),
-    "foam-2": (4.44, 4.5),
-}
+VELOCITIES = {f"foam-1/model-{i}": (1.75, 2.0) for i in (1, 2, 3)} | {"foam-2": (4.44, 4.5)}
 
 TABLE = """\
 # RECONSTRUCTION, not a measurement: simulated from the published parameters of {set}
