@@ -24,11 +24,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 import foamfit as ff
 from foamfit.report.figures import drawing
 
+Array = NDArray[np.float64]
 HERE = Path(__file__).parent
 sys.path += sorted(str(place) for place in HERE.iterdir() if place.is_dir())
 
@@ -195,9 +197,7 @@ def gridlines(ax: Any) -> None:
     ax.set_axisbelow(True)
 
 
-def at_shares(
-    strain: np.ndarray, stress: np.ndarray, up: np.ndarray, down: np.ndarray, left: float = np.nan
-) -> np.ndarray:
+def at_shares(strain: Array, stress: Array, up: Array, down: Array, left: float = np.nan) -> Array:
     """Return a loop's stress at shares of its largest strain: loading `up`, then unloading `down`.
 
     `left` is the stress below the end of unloading.

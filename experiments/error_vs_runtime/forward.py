@@ -33,10 +33,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
 import with_scipy
 from independent import follow
-from studies import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
+from studies import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, Array
 
 HERE = Path(__file__).parent
-Array = np.ndarray
 Answer = tuple[Array, Array]  # displacement of the top (m) and base stress (Pa), (n,) each
 
 SAMPLES, LENGTH = 501, 0.8e-3
@@ -244,7 +243,8 @@ def take_turns(timed: list[Timed], budget: float) -> None:
     share = budget / len(timed)
     for turn, one in product(range(ROUNDS), timed):
         together = max(1, round(SHORTEST / one.first))
-        count = min(max(round(share / (one.first * together)), 3), ROUNDS) * (one.first < SLOW)
+        count = min(max(round(share / (one.first * together)), 3), ROUNDS)
+        count = count if one.first < SLOW else 0
         if (turn + 1) * count // ROUNDS > turn * count // ROUNDS:
             if one.first < BRIEF:  # the previous run has displaced the caches
                 one.run()

@@ -38,9 +38,9 @@ from foamfit.fitting.search import box_starts
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import records
 import studies
+from studies import Array
 
 HERE = Path(__file__).parent
-Array = NDArray[np.float64]
 SOLVED = 1.05  # cost over the best known cost at which a problem counts as solved
 ENOUGH = 1.001  # cost over the best known at which a run ends
 RECORDED = 0.98  # a cost is recorded below this multiple of the last recorded one

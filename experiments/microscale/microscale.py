@@ -10,17 +10,15 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 import foamfit as ff
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
 from cycles import Ensemble
-from studies import BLACK, BLUE, GREY, VERMILION
+from studies import BLACK, BLUE, GREY, VERMILION, Array
 
 HERE = Path(__file__).parent
-Array = NDArray[np.float64]
 
 VALUES = {
     "k0": 5.5e5, "kc": 2.5e5, "eps_star": 0.08, "sigma_plus": 1.3e5, "spread_plus": 0.4,

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import claims
 import foamfit as ff
@@ -22,10 +21,9 @@ from foamfit.springs.law import BRANCH_NAMES
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
-from studies import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILION
+from studies import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILION, Array
 
 HERE = Path(__file__).parent
-Array = NDArray[np.float64]
 
 
 def mark(ax: Any, x: float, text: str, y: float = 0.03, dx: int = 3, **more: Any) -> None:

@@ -428,17 +428,14 @@ def relaxing_motion(
     return spec
 
 
-def worn_motion(rng: Generator, number: int) -> Spec:
-    return (relaxing_motion if number % 2 else known_motion)(rng, number, worn)
-
-
 DRAWN: dict[str, Callable[[Generator, int], Spec]] = {
     "base": base, "gap": gap, "turns": turns, "long": long,
     "microscale": alike(microscale, False), "relaxation": alike(bistable, True),
     "microscale+relaxation": alike(microscale, True), "mixed": mixed,
     "motion": known_motion, "motion+relaxation": relaxing_motion,
     "worn": alike(worn, False), "worn+relaxation": alike(worn, True),
-    "worn chain": partial(mixed, draw=worn, heavy=0.7), "worn motion": worn_motion,
+    "worn chain": partial(mixed, draw=worn, heavy=0.7),
+    "worn motion": lambda rng, n: (relaxing_motion if n % 2 else known_motion)(rng, n, worn),
 }  # fmt: skip
 FAMILIES = ("study", *DRAWN)
 MEMORY, REMEMBERING = FAMILIES[5:11], FAMILIES[11:]

@@ -27,12 +27,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import foamfit as ff
 import studies
 from families import FAMILIES, MEMORY, REMEMBERING, SEED, spec_of
-from independent import LOOSE, Truth, follow, judge, over_range
+from independent import LOOSE, Array, Truth, follow, judge, over_range
 from scenes import Scene, Spec, scene_from
 
 HERE = Path(__file__).parent
 KEPT = HERE / "fresh.csv"
-Array = NDArray[np.float64]
 RTOLS = (1e-4, 1e-6, 1e-8)
 MOST = {"base": 10_000_000, "long": 20_000_000}  # limit of the judge: steps times springs
 USUAL_MOST = 4_000_000

@@ -155,30 +155,16 @@ def row_of(spring: Any, height: float) -> tuple[list[float], int]:
 
 
 @inner
-def _sigma(p: Array, branch: int, eps: float) -> float:
-    if branch == A:
-        return p[K0] * eps / (1.0 - eps) if eps < 1.0 else math.inf
+def _pressed(p: Array, branch: int, eps: float) -> tuple[float, float]:
+    """Return stress (infinite past a pole) and slope of a linear or bistable spring."""
     if branch == D:
-        return p[SIG_A] + p[UP] * (eps - p[EPS_A])
-    if branch == C:
-        x = eps - p[STAR]
-        return p[KC] * x / (1.0 - x) if x < 1.0 else math.inf
+        return p[SIG_A] + p[UP] * (eps - p[EPS_A]), p[UP]
     if branch == E:
-        return p[SIG_C] + p[DOWN] * (eps - p[EPS_C])
-    return 0.0 if branch == GAP else p[K0] * eps
-
-
-@inner
-def _slope(p: Array, branch: int, eps: float) -> float:
-    if branch == A:
-        return p[K0] / (1.0 - eps) ** 2
-    if branch == D:
-        return p[UP]
-    if branch == C:
-        return p[KC] / (1.0 - (eps - p[STAR])) ** 2
-    if branch == E:
-        return p[DOWN]
-    return 0.0 if branch == GAP else p[K0]
+        return p[SIG_C] + p[DOWN] * (eps - p[EPS_C]), p[DOWN]
+    if branch in (A, C):
+        k, x = (p[K0], eps) if branch == A else (p[KC], eps - p[STAR])
+        return k * x / (1.0 - x) if x < 1.0 else math.inf, k / (1.0 - x) ** 2
+    return (0.0, 0.0) if branch == GAP else (p[K0] * eps, p[K0])
 
 
 @inner
@@ -317,8 +303,7 @@ def fill_rates(
             if not soft[i] > 0.0:
                 return False
         else:
-            s = _sigma(p, flags.branch[i], x)
-            slope = _slope(p, flags.branch[i], x)
+            s, slope = _pressed(p, flags.branch[i], x)
             soft[i] = 1.0 / slope if slope > 0.0 else math.inf
         gain[i], held[i], fade[i] = 1.0, 0.0, 0.0
         for n in range(terms):
@@ -845,11 +830,6 @@ def _shares(chain: Any, drive: Any, ends: Integers) -> bool:
     return False
 
 
-def has_memory(chain: Any) -> bool:
-    """Return whether a spring of a chain is microscale or relaxes."""
-    return any(hasattr(s, "sigma_plus") or getattr(s, "relaxation", ()) for s in chain.springs)
-
-
 def system_of(chain: Any, drive: Any, time: Array) -> tuple[System, Integers]:
     """Return the constants of a run and the initial branches."""
     pairs = [row_of(s, h) for s, h in zip(chain.springs, chain.heights, strict=True)]
@@ -885,7 +865,7 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = 
         time = time - time[0]
     system, kinds = system_of(chain, drive, time)
     nodes, base = np.zeros((count, time.size)), np.zeros(time.size)
-    if not has_memory(chain):
+    if not any(hasattr(s, "sigma_plus") or getattr(s, "relaxation", ()) for s in chain.springs):
         too_long = _fastest(system) * (time[-1] - time[0]) > 6.0 * most / count
         if too_long or _shares(chain, drive, system.ends):
             why = WHY[TOO_LONG] if too_long else SHARED
@@ -905,7 +885,5 @@ def judge(chain: Any, drive: Any, time: Array, most: int = MOST_WORK) -> Truth:
     loose = follow(chain, drive, time, LOOSE, most)
     if loose.why:
         return loose
-    pairs = zip(loose.displacement, tight.displacement, strict=True)
-    apart = max(over_range(one, other) for one, other in pairs)
-    apart = max(apart, over_range(loose.base_stress, tight.base_stress))
-    return replace(tight, unsure=apart)
+    curves = (np.vstack((one.base_stress, one.displacement)) for one in (loose, tight))
+    return replace(tight, unsure=max(map(over_range, *curves)))

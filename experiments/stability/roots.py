@@ -98,10 +98,7 @@ class _Microscale(_Linear):
         self.rank, self.most = self.moved(s)
 
 
-def _spring(spring: Any) -> _Linear:
-    if hasattr(spring, "sigma_plus"):
-        return _Microscale(spring)
-    return _Bistable(spring) if hasattr(spring, "kc") else _Linear(spring)
+KINDS = {"sigma_plus": _Microscale, "kc": _Bistable, "k0": _Linear}  # by what only they have
 
 
 def _root(springs: list[_Linear], heights: list[Any], top: Any, s: Any) -> Any:
@@ -135,7 +132,8 @@ def _root(springs: list[_Linear], heights: list[Any], top: Any, s: Any) -> Any:
 def follow(chain: Any, drive: Any, time: Array) -> Truth:
     """Follow a chain over the samples of a known displacement of its top."""
     with mp.workdps(DIGITS):
-        springs = [_spring(spring) for spring in chain.springs]
+        springs = [next(kind for name, kind in KINDS.items() if hasattr(spring, name))(spring)
+                   for spring in chain.springs]  # fmt: skip
         heights = [mpf(h) for h in chain.heights]
         base, nodes = np.empty(time.size), np.empty((len(springs), time.size))
         s = mpf(0)
