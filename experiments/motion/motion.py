@@ -162,7 +162,7 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterato
         "what": "motion", "rms": off / noise @ off / noise / rows,
         "near": float(np.mean((off[near] / noise) ** 2)) if near.any() else np.nan,
         "held": held.mean(), "held_near": held[near].mean() if near.any() else np.nan,
-        "worst": np.abs(off).max() / noise, "sigma": found.sigma / noise,
+        "worst": np.abs(off).max() / noise,
         "invented": len(found.turns) - len(pairs), "back": back,
         "modes": found.modes(t[:1]).shape[1],
     }  # fmt: skip
@@ -231,7 +231,6 @@ def main() -> None:
         row for (k, name), n, (i, noise), draw in cases
         for row in one(name, n, noise, np.random.default_rng([options.seed, k, n, i, draw]))
     )  # fmt: skip
-    sigma = data[data.what == "motion"].sigma
     percents = (100.0 * data.noise).round(3).astype(str)
     data["cell"] = data.rows.astype(str) + " rows, " + percents + " %"
     tables = {"classes": table(data, "class"), "cells": table(data, "cell")}
@@ -240,8 +239,7 @@ def main() -> None:
     whole = options.draws >= 25 and options.seed == 0
     with studies.workplace() as folder:
         print(studies.write_page(
-            HERE, HERE if whole else folder, draws=options.draws * len(ROWS) * len(NOISE),
-            sigma=f"{sigma.quantile(0.025):.2f} to {sigma.quantile(0.975):.2f}", **values,
+            HERE, HERE if whole else folder, draws=options.draws * len(ROWS) * len(NOISE), **values
         ))  # fmt: skip
 
 
