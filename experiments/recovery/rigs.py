@@ -211,9 +211,9 @@ def run_test(family: str, name: str, seed: int) -> list[Row]:
         return [about | {"error": text, "seconds": time.perf_counter() - began}]
     about |= {"status": result.status, "seconds": time.perf_counter() - began}
     if family == "slow":
-        chains, drive = (
-            (result.chain, chain_of(record.rig)),
+        drive, chains = (
             ff.DisplacementDrive(test.displacement),
+            (result.chain, chain_of(record.rig)),
         )
         with suppress(SimulationError):  # the misfit over that of the true springs
             each = [ff.simulate(chain, drive, test.time).base_stress for chain in chains]
