@@ -53,13 +53,10 @@ LAW = ff.Law(
     title="Bouc-Wen spring beside an elastic foam",
     params=(
         *CURVE,
-        ff.Param(
-            "k", ("k", ""), "Pa", "hysteretic stiffness", (1.0, "slope"), (1e-3, 1e3), "slope"
-        ),
-        ff.Param(
-            "limit", ("z", "m"), "", "largest hysteretic strain", (0.1, "strain"), (1e-3, 1.0),
-            "strain",
-        ),
+        ff.Param("k", ("k", ""), "Pa", "hysteretic stiffness", (1.0, "slope"), (1e-3, 1e3),
+                 "slope"),
+        ff.Param("limit", ("z", "m"), "", "largest hysteretic strain", (0.1, "strain"),
+                 (1e-3, 1.0), "strain"),
         ff.Param("n", ("n", ""), "", "sharpness of the yield", (1.0, "one"), (0.3, 10.0)),
     ),
     functions=ff.Functions(stress, along, None, ends, switch, admissible=admissible),

@@ -64,13 +64,10 @@ LAW = ff.Law(
     title="Ogden spring with a fractional element",
     params=(
         *CURVE,
-        ff.Param(
-            "strength", ("g", ""), "", "strength of the spring-pot", (0.3, "one"), (1e-4, 1e2)
-        ),
-        ff.Param(
-            "order", ("a", ""), "", "order of the derivative", (0.2, "one"), (0.01, 0.99),
-            admissible="between 0 and 1",
-        ),
+        ff.Param("strength", ("g", ""), "", "strength of the spring-pot", (0.3, "one"),
+                 (1e-4, 1e2)),
+        ff.Param("order", ("a", ""), "", "order of the derivative", (0.2, "one"), (0.01, 0.99),
+                 admissible="between 0 and 1"),
     ),
     functions=ff.Functions(stress, decay=decay, admissible=admissible),
     internal=N,

@@ -59,12 +59,10 @@ LAW = ff.Law(
     title="Maxwell-slip spring",
     params=(
         *CURVE,
-        ff.Param(
-            "k", ("k", ""), "Pa", "stiffness of all sliders", (1.0, "slope"), (1e-3, 1e3), "slope"
-        ),
-        ff.Param(
-            "slip", ("y", "m"), "", "largest slip strain", (0.2, "strain"), (1e-3, 1e1), "strain"
-        ),
+        ff.Param("k", ("k", ""), "Pa", "stiffness of all sliders", (1.0, "slope"), (1e-3, 1e3),
+                 "slope"),
+        ff.Param("slip", ("y", "m"), "", "largest slip strain", (0.2, "strain"), (1e-3, 1e1),
+                 "strain"),
         ff.Param("spread", ("s", ""), "", "spread of the slip strains", (1.0, "one"), (0.1, 10.0)),
     ),
     functions=ff.Functions(stress, ends=ends, switch=switch, admissible=admissible),

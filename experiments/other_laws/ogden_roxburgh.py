@@ -64,10 +64,8 @@ LAW = ff.Law(
     params=(
         *CURVE,
         ff.Param("r", ("r", ""), "", "inverse of the largest softening", (1.5, "one"), (1.0, 1e2)),
-        ff.Param(
-            "m", ("m", ""), "Pa", "energy over which it softens", (0.1, "stress"), (1e-4, 1e1),
-            "stress",
-        ),
+        ff.Param("m", ("m", ""), "Pa", "energy over which it softens", (0.1, "stress"),
+                 (1e-4, 1e1), "stress"),
     ),
     functions=ff.Functions(stress, ends=ends, switch=switch, admissible=admissible),
     internal=1,

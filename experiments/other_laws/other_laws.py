@@ -7,6 +7,7 @@ Method and answer: README.md. Also written: other_laws.csv (a row per fit) and o
 
 import argparse
 import importlib
+import re
 import sys
 from itertools import product
 from pathlib import Path
@@ -71,19 +72,13 @@ SHOWN = ("turbo-comp-1", "outplane-4s-1", "tpu87-20 cycle 10", "cartilage 1")
 
 
 def read(name: str, folder: Path) -> ff.Measurement:
-    """Read a test like a user, and thin it."""
+    """Read a test like a user; keep every n-th row, at most `ROWS`, and no striker."""
     record, _, cycle = name.partition(" cycle ")
-    path = records.place(record, folder)
-    test = ff.read_test(path, cycle=int(cycle) if cycle else None)
-    return thinned(test, folder / f"{name}.csv")
-
-
-def thinned(test: ff.Measurement, path: Path) -> ff.Measurement:
-    """Keep every n-th row of a test, at most `ROWS`, as a test without a striker."""
+    test = ff.read_test(records.place(record, folder), cycle=int(cycle) if cycle else None)
     step, own = -(-test.time.size // ROWS), test.specimen
     toml = f'name = "{test.name}"\n[specimen]\nheight = "{own.height} m"\narea = "{own.area} m^2"\n'
     columns = {name: getattr(test, name)[::step] for name in ("time", "stress", "displacement")}
-    return ff.read_test(studies.write_test(path, toml, **columns))
+    return ff.read_test(studies.write_test(folder / f"{name}.csv", toml, **columns))
 
 
 def fit_all(case: tuple[str, str, str], starts: int) -> list[dict[str, Any]]:
@@ -116,11 +111,11 @@ def fit_all(case: tuple[str, str, str], starts: int) -> list[dict[str, Any]]:
 def predicted(result: Any, test: ff.Measurement) -> dict[str, float]:
     """Return the misfit of an unseen test: as predicted, and after scaling the stress."""
     one = ff.predict(result, test).curves["stress_strain"]
-    factor = one.predicted @ one.measured / (one.predicted @ one.predicted)
-    off = {"predicted": one.predicted, "scaled": factor * one.predicted}
+    factors = {"predicted": 1.0}
+    factors["scaled"] = one.predicted @ one.measured / (one.predicted @ one.predicted)
     return {
-        name: float(np.sqrt(np.mean((curve - one.measured) ** 2)) / np.ptp(one.measured))
-        for name, curve in off.items()
+        name: float(np.sqrt(np.mean((k * one.predicted - one.measured) ** 2)) / one.range)
+        for name, k in factors.items()
     }
 
 
@@ -149,8 +144,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         for (i, name), (column, law) in product(enumerate(tests), enumerate(names)):
             row, ax = found[name, law], axes[i, column]
             if name == tests[0]:
-                title = law.replace(": ", ":\n").replace(", ", ",\n")
-                title = title.replace(" on ", "\non ").replace(" beside ", "\nbeside ")
+                title = re.sub(r"(?<=[:,]) | (?=on |beside )", "\n", law)
                 ax.set_title(title, fontsize=6.5)
             if name == tests[-1]:
                 ax.set_xlabel("strain (–)")
@@ -158,25 +152,22 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             factor, unit = (1e6, "MPa") if measured.max() > 1e6 else (1e3, "kPa")
             ax.plot(strain, measured / factor, color="0.6", lw=1.6)
             ax.plot(strain, fitted / factor, color=studies.VERMILION, lw=0.9)
-            ax.text(
-                0.05, 0.95, f"{100.0 * row['misfit']:.2f} %", transform=ax.transAxes, va="top",
-                fontsize=7,
-            )  # fmt: skip
+            misfit = f"{100.0 * row['misfit']:.2f} %"
+            ax.text(0.05, 0.95, misfit, transform=ax.transAxes, va="top", fontsize=7)
             if column == 0:
                 ax.set_ylabel(f"{name}\nstress ({unit})", fontsize=7)
-        figure.suptitle(
+        title = (
             "Measured (grey; shoe foam arXiv:2602.12694, mycelium LivingMatterLab/CANN, lattice "
-            "mev43/FYP-Cyclic-Compression, cartilage JoVE 64450), fitted (red), misfit",
-            x=0.01, ha="left", fontsize=7.5,
-        )  # fmt: skip
+            "mev43/FYP-Cyclic-Compression, cartilage JoVE 64450), fitted (red), misfit"
+        )
+        figure.suptitle(title, x=0.01, ha="left", fontsize=7.5)
 
 
 def main() -> None:
     """Fit, and write page, table and figure."""
     numbers = {"starts": (6, "descents of each fit"), "jobs": (1, "processes")}
-    parser = studies.arguments(__doc__, out=HERE, **numbers)
+    parser = studies.arguments(__doc__, HERE, page=True, **numbers)
     parser.add_argument("--only", default="", help="tests whose name contains this")
-    parser.add_argument("--page", action="store_true", help="only write the page, from the CSV")
     given = parser.parse_args()
     if not given.page:
         fit_tests(given)

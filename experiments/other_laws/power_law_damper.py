@@ -73,28 +73,16 @@ def read_off(loop, marks, scales, way):
 
 
 LAW = replace(
-    PAPER,
-    kind="bistable-power-damper",
-    title="bistable spring beside a power-law damper",
+    PAPER, kind="bistable-power-damper", title="bistable spring beside a power-law damper",
     params=(
         *PAPER.params,
-        ff.Param(
-            "c", ("c", ""), "Pa", "damping stress at 1 1/s", (0.02, "stress"), (1e-8, 1e2), "stress"
-        ),
+        ff.Param("c", ("c", ""), "Pa", "damping stress at 1 1/s", (0.02, "stress"), (1e-8, 1e2),
+                 "stress"),
         ff.Param("n", ("n", ""), "", "exponent of the damper", (0.5, "one"), (0.02, 2.0)),
     ),
-    functions=ff.Functions(
-        stress, ends=ends, switch=switch, viscous=viscous, admissible=admissible
-    ),
-    numbered=tuple("adce"),
-    spring=None,
-    published=False,
-    searched=(*PAPER.searched, "c", "n"),
-    read_off=read_off,
-    read_in_series=None,
-    marks=7,
-    neighbours=lambda values, top: iter(()),
-    exchanged=None,
-    points=(),
-    compared=(),
+    functions=ff.Functions(stress, ends=ends, switch=switch, viscous=viscous,
+                           admissible=admissible),
+    numbered=tuple("adce"), spring=None, published=False, searched=(*PAPER.searched, "c", "n"),
+    read_off=read_off, read_in_series=None, marks=7, neighbours=lambda values, top: iter(()),
+    exchanged=None, points=(), compared=(),
 )  # fmt: skip
