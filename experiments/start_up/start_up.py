@@ -27,31 +27,20 @@ import studies
 HERE = Path(__file__).parent
 TOML = '[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n'
 TOML += '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
-PARTS = (
-    "start of Python, command line",
-    "CSV and TOML read (pandas, pint, parts of SciPy)",
-    "import of the fit (numba, SciPy, lmfit)",
-    "fit and intervals, compiled loops loaded",
-    "figures, report, result folder",
+PARTS = {  # of a fit, and what each runs
+    "start of Python, command line": "import foamfit.cli",
+    "CSV and TOML read (pandas, pint, parts of SciPy)":
+        "import foamfit; test = foamfit.read_test(sys.argv[1])",
+    "import of the fit (numba, SciPy, lmfit)": "from foamfit import api",
+    "fit and intervals, compiled loops loaded": "result = api.fit(test)",
+    "figures, report, result folder": "result.save(sys.argv[2])",
+}  # fmt: skip
+MARK = "\nmarks.append(time.perf_counter())\n"
+PROBE = (  # garbage is collected as in the command
+    "import gc, sys, time\ngc.set_threshold(100_000, 20, 10)\nmarks = [time.perf_counter()]\n"
+    + MARK.join([*PARTS.values(), ""])
+    + "print(*(after - before for before, after in zip(marks, marks[1:])))\ngc.freeze()"
 )
-PROBE = """
-import gc, sys, time
-gc.set_threshold(100_000, 20, 10)  # as the command
-marks = [time.perf_counter()]
-import foamfit.cli
-marks.append(time.perf_counter())
-import foamfit
-test = foamfit.read_test(sys.argv[1])
-marks.append(time.perf_counter())
-from foamfit import api
-marks.append(time.perf_counter())
-result = api.fit(test)
-marks.append(time.perf_counter())
-result.save(sys.argv[2])
-marks.append(time.perf_counter())
-print(*(after - before for before, after in zip(marks, marks[1:])))
-gc.freeze()  # as in the command
-"""
 
 
 def write(folder: Path, rows: int) -> Path:
