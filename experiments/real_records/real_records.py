@@ -7,11 +7,9 @@ Method and answer: README.md. Also written: fits.csv and loops.csv.
 
 import math
 import sys
-import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import pandas as pd
@@ -22,9 +20,9 @@ import foamfit as ff
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import records
 import studies
+from studies import Array
 
 HERE = Path(__file__).parent
-Array = np.ndarray
 
 MODELS = {"bistable": 0, "microscale": 1}  # and the number of relaxation terms
 LAWS = {"bistable": "bistable", "microscale": "microscale, relaxation"}  # in the tables
@@ -32,8 +30,7 @@ STARTS = 25
 SECONDS = 60.0
 
 
-@dataclass(frozen=True)
-class Real:
+class Real(NamedTuple):
     """A record: height (m), and its columns of motion and stress with their units."""
 
     name: str
@@ -46,17 +43,14 @@ RECORDS = (
     Real("cartilage 1", 0.563e-3),
     Real("cartilage 3", 0.563e-3),
     Real("lattice drop", 20e-3, stress=("specific_force_N_per_kg", 1.0 / 400e-6)),
-    Real(
-        "aluminium foam", 15e-3, ("reference_engineering_strain", 15e-3),
-        ("reference_engineering_stress_MPa", 1e6),
-    ),
+    Real("aluminium foam", 15e-3, ("reference_engineering_strain", 15e-3),
+         ("reference_engineering_stress_MPa", 1e6)),
     Real("turbo-comp-2", 9.66e-3),
     Real("leap-comp-3", 10.68e-3),
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Judge:
+class Judge(NamedTuple):
     """What a file says without foamfit, in SI."""
 
     rise: float  # s, time at which the stress leaves 1 % of its peak for good
@@ -106,9 +100,8 @@ def fits(folder: Path) -> Iterator[dict[str, object]]:
         judge, test = Judge.of(real, path), ff.read_test(path)
         for drive in (None, "displacement"):
             for model, terms in MODELS.items():
-                began = time.perf_counter()
-                result = ff.fit(test, model=model, relaxation=terms, drive=drive)
-                seconds = time.perf_counter() - began
+                options = {"model": model, "relaxation": terms, "drive": drive}
+                result, seconds = studies.timed(ff.fit, test, **options)
                 wrong = list(judge.excluded(result, real.height))
                 wrong += [f"{seconds:.0f} s"] if seconds > SECONDS else []
                 misfits = [f"{100.0 * m:.1f}" for m in result.misfit.values() if m is not None]
