@@ -96,8 +96,9 @@ def measure_speedup(place: Path, *words: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def task(path: Path, toml: Path, recipe: Recipe, out: Path) -> Task:
+def task(path: Path, recipe: Recipe, out: Path) -> Task:
     """Return a test as the command hands it to a process."""
+    toml = path.parent.with_name("foam.toml")
     return Task(path.stem, path, toml, recipe, fingerprint(recipe, path, toml), out)
 
 
@@ -105,24 +106,20 @@ def measure_overhead(place: Path) -> dict[str, Any]:
     """Measure the overhead per test (read, compare, write) and the complete command."""
     make_tests(place / "tests", TINY, 601)
     recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=False)
-    fits, real = [0.0], study.fit
+    fits, real = list[float](), study.fit
 
     def fit(*words: Any, **options: Any) -> Any:
-        began = time.process_time()
-        try:
-            return real(*words, **options)
-        finally:
-            fits[0] += time.process_time() - began
+        result, seconds = studies.timed(real, *words, **options)
+        fits.append(seconds)
+        return result
 
-    paths, count = sorted((place / "tests").iterdir()), TINY - 20
+    def whole(path: Path) -> None:
+        work(task(path, recipe, place / "out" / path.stem))
+
     with patch.object(study, "fit", fit):
-        for i, path in enumerate(paths):
-            if i == 20:  # everything is loaded
-                fits[0], began = 0.0, time.process_time()
-            work(task(path, place / "foam.toml", recipe, place / "out" / path.stem))
-        spent = time.process_time() - began
-    each, beside = 1e3 * fits[0] / count, 1e3 * (spent - fits[0]) / count
-    return {"tests": count, "fit_ms": each, "beside_ms": beside}
+        every = [studies.timed(whole, path)[1] for path in sorted((place / "tests").iterdir())]
+    mean = [1e3 * float(np.mean(each[20:])) for each in (fits, every)]  # then all is loaded
+    return {"tests": TINY - 20, "fit_ms": mean[0], "beside_ms": mean[1] - mean[0]}
 
 
 def measure_memory(place: Path) -> dict[str, Any]:
@@ -148,15 +145,15 @@ def measure_memory(place: Path) -> dict[str, Any]:
 def measure_parts(place: Path) -> dict[str, Any]:
     """Measure the work of the coordinating process per test (ms) and the disk usage."""
     make_tests(place / "tests", 50, 601)
-    toml, paths, found = place / "foam.toml", sorted((place / "tests").iterdir()), {}
+    paths, found = sorted((place / "tests").iterdir()), {}
     for name, pages in {"no report": False, "reports": True}.items():
         recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=pages)
-        first = task(paths[0], toml, recipe, place / name)
+        first = task(paths[0], recipe, place / name)
         work(first)
         files = [path.stat().st_size for path in first.out.iterdir()]
         began = time.process_time()
         for path in paths:
-            fingerprint(recipe, path, toml)
+            fingerprint(recipe, path, first.toml)
             stored(first)
         again = 1e3 * (time.process_time() - began) / len(paths)
         found[name] = {"files": len(files), "kB": sum(files) / 1e3, "again_ms": again}
