@@ -6,7 +6,6 @@ Method and answer: README.md.
 """
 
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -36,23 +35,20 @@ FITS: tuple[tuple[str, dict[str, Any]], ...] = (
 
 
 def plain(test: ff.Measurement) -> tuple[float, float]:
-    """Return the seconds and the misfit (%) of plain least squares with one bistable spring."""
-    began = time.perf_counter()
-    misfit = plain_misfit(test, "bistable", 0.0, starts=STARTS)
-    return time.perf_counter() - began, 100.0 * misfit
+    """Return misfit and seconds of plain least squares with one bistable spring."""
+    return studies.timed(plain_misfit, test, "bistable", 0.0, starts=STARTS)
 
 
 def rows(found: dict[str, ff.Measurement]) -> Iterator[dict[str, object]]:
     """Yield one row for each fit."""
+    for name, options in FITS:  # compiles
+        auto = options["model"] == "auto"
+        for one in ("microscale", "bistable+bistable") if auto else (options["model"],):
+            ff.fit(found[name], **options | {"model": one}, max_time=0.5)
+    unit = plain(found["turbo-comp-2"])[1]
     for name, options in FITS:
-        model, terms = options["model"], options.get("relaxation", 0)
-        for one in ("microscale", "bistable+bistable") if model == "auto" else (model,):
-            ff.fit(found[name], model=one, relaxation=terms, max_time=0.5)
-    unit = plain(found["turbo-comp-2"])[0]
-    for name, options in FITS:
-        began = time.perf_counter()
-        result = ff.fit(found[name], **options)
-        seconds, (later, _) = time.perf_counter() - began, plain(found["turbo-comp-2"])
+        result, seconds = studies.timed(ff.fit, found[name], **options)
+        later = plain(found["turbo-comp-2"])[1]
         effort, misfit = result.effort, result.misfit["stress_strain"]
         yield {
             "record": name, "fit": " ".join(f"--{key} {value}" for key, value in options.items()),
@@ -74,10 +70,10 @@ def main() -> None:
     with studies.workplace() as folder:
         found = {name: ff.read_test(records.place(name, folder)) for name, _ in FITS}
         table = studies.said(rows(found))
-        seconds, misfit = plain(found["turbo-comp-2"])
+        misfit, seconds = plain(found["turbo-comp-2"])
     studies.write_page(
         HERE, args.out, table=studies.shown(table), seconds=f"{seconds:.2f}",
-        misfit=f"{misfit:.2f}", starts=STARTS,
+        misfit=f"{100.0 * misfit:.2f}", starts=STARTS,
     )  # fmt: skip
 
 
