@@ -22,7 +22,7 @@ from rig import Impact, Slow, impact, slow, write
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
-Row = tuple[str, str, str]  # result, quantity, value
+Row = tuple[str, str, str | float | None]  # result, quantity, value
 FILE = HERE / "frozen.csv"
 EXACT, OTHER, ERRORS = 1e-9, 1e-3, 0.01
 RECORDS = {
@@ -41,7 +41,7 @@ RECORDS = {
     "slow, two springs": Slow("bistable+bistable", noise=1e-3),
     "slow, inner loop": Slow(inner=0.1, noise=1e-3),
 }
-FITS = {  # reconstruction, model, drive
+FITS = {  # reconstruction: model, drive
     "foam-1/model-1-2.0mps": ("bistable", "impact"),
     "foam-1/model-1-1.75mps": ("bistable", "displacement"),
     "foam-1/model-2-2.0mps": ("bistable", "impact"),
@@ -57,16 +57,11 @@ KINDS = dict.fromkeys(SHARED, "shared") | {"sigma_plus": "scatter"}
 def of_fit(name: str, result: ff.FitResult) -> Iterator[Row]:
     """Yield the reference numbers of a fit."""
     yield name, "status", result.status
-    for curve, misfit in result.misfit.items():
-        if misfit is not None:
-            yield name, f"misfit {curve}", repr(float(misfit))
+    yield from ((name, f"misfit {curve}", misfit) for curve, misfit in result.misfit.items())
     for parameter, p in result.parameters.items():
-        yield name, f"{parameter} state", p.state
-        yield name, f"{parameter} value", repr(float(p.value))
         low, high = p.ci95 or (None, None)
-        for what, number in {"stderr": p.stderr, "low": low, "high": high}.items():
-            if number is not None:
-                yield name, f"{parameter} {what}", repr(float(number))
+        found = {"state": p.state, "value": p.value, "stderr": p.stderr, "low": low, "high": high}
+        yield from ((name, f"{parameter} {what}", value) for what, value in found.items())
 
 
 def fits(folder: Path) -> Iterator[Row]:
@@ -101,8 +96,8 @@ def simulations() -> Iterator[Row]:
             found = ff.simulate(chain, driven, time)
             stress, end = found.base_stress, found.contact_end
             marks = {"peak": stress.max(), "mean": stress.mean(), "strain": found.strain.max()}
-            for mark, value in (marks if end is None else marks | {"end": end}).items():
-                yield f"simulation {name}, {drive}", mark, repr(float(value))
+            for mark, value in (marks | {"end": end}).items():
+                yield f"simulation {name}, {drive}", mark, value
 
 
 def together(folder: Path) -> Iterator[Row]:
@@ -124,23 +119,19 @@ def together(folder: Path) -> Iterator[Row]:
     )
     found = ff.joint(study)
     for name, one in found.parameters.items():
-        yield "joint", f"{name} value", repr(float(one.value))
+        yield "joint", f"{name} value", one.value
         if one.ci95 is not None:
-            yield "joint", f"{name} stderr", repr(float(one.ci95[1] - one.ci95[0]) / 3.92)
-        prediction = ff.predict(found, folder / "other.csv")
-    for curve, share in prediction.inside.items():
-        yield "prediction", f"inside {curve}", repr(float(share))
-        yield "prediction", f"band {curve}", repr(float(prediction.curves[curve].half_width))
+            yield "joint", f"{name} stderr", float(one.ci95[1] - one.ci95[0]) / 3.92
+    for curve, one in ff.predict(found, folder / "other.csv").curves.items():
+        yield "prediction", f"inside {curve}", one.inside
+        yield "prediction", f"band {curve}", one.half_width
 
 
 def changed(before: dict[tuple[str, str], str], now: dict[tuple[str, str], str]) -> list[str]:
     """Return a sentence for each difference."""
     out = [f"{' '.join(key)}: gone" for key in before if key not in now]
     for (name, what), value in now.items():
-        old = before.get((name, what))
-        if old is None:
-            out.append(f"{name} {what}: new ({value})")
-            continue
+        old = before.get((name, what), "nothing")
         try:
             size, off = abs(float(old)), abs(float(value) - float(old))
         except ValueError:
@@ -161,7 +152,11 @@ def main() -> int:
     parser.add_argument("--renew", action="store_true")
     options = parser.parse_args()
     with studies.workplace() as folder:
-        rows = [*simulations(), *fits(folder), *together(folder)]
+        found = [*simulations(), *fits(folder), *together(folder)]
+    rows = [
+        (*key, value if isinstance(value, str) else repr(float(value)))
+        for *key, value in found if value is not None
+    ]  # fmt: skip
     if options.renew:
         pd.DataFrame(rows, columns=["result", "quantity", "value"]).to_csv(FILE, index=False)
         return 0
