@@ -47,6 +47,7 @@ from foamfit.trust.residuals.law_error import CurveError
 ASTRAY = 2.0
 CLOSE = 0.9  # smallest correlation that is named
 UNDER = 0.05  # share of the peak stress, above which a record ends under load
+CLOSED = 0.005  # area of a loop over peak stress times largest strain, below which it is closed
 
 
 def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None = None) -> Fit:
@@ -233,10 +234,24 @@ def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict
         and any(UNDER_LOAD in note for note in test.notes),
         "ended": ended if errs and objective.drive != "impact" and ended > UNDER else 0.0,
         "lost": lost_height(best),
+        "stayed": test.last_cycle is None and test.start_strain != 0.0 and _is_closed(best),
         "alone": errs and not (record.stopped or record.led) and 0 < record.agreeing < 2,
         "off": misfit if misfit > POOR else 0.0,
         "curve": curve,
     }
+
+
+def _is_closed(best: BestPoint) -> bool:
+    """Return whether loading and unloading coincide in a fitted spring without inner loops.
+
+    If it has not snapped back after a cycle, it goes up and down branches e and c in the next one,
+    as a fresh spring does on branches that coincide.
+    """
+    motion, laws = best.simulated.motion, best.problem.model.laws
+    own = np.diff(motion.displacement, axis=0, prepend=0.0)  # compression of each spring
+    loops = [np.abs(np.trapezoid(motion.base_stress, w)) / np.ptp(w) for w in own]
+    kept = [law.hysteretic and not law.inner_loops for law in laws]
+    return any(np.array(loops)[kept] < CLOSED * motion.base_stress.max())
 
 
 def _is_led(test: Measurement) -> bool:
