@@ -225,7 +225,8 @@ def identify(
     led = below is not None
     record = SearchRecord(options.seed, starts, began, compiled=SPENT.seconds, led=led)
     known = [] if below is None else carried(problem.space(), below.problem.space(), below.minima())
-    found = _search(Found(problem, tracker, record), options.vary, progress, known)
+    given = {*(options.fix or {}), *(params or {})}
+    found = _search(Found(problem, tracker, record), options.vary, given, progress, known)
     if tracker.best_values is None:
         objective, why = found.problem.objective, "check the drive, the heights and the bounds"
         tried = objective.evaluations
@@ -309,12 +310,14 @@ def _assess(
 
 
 def _search(
-    begun: Found, asked: Collection[str], progress: Progress, known: Sequence[Array]
-) -> Found:
+    begun: Found, asked: Collection[str], given: Collection[str], progress: Progress,
+    known: Sequence[Array],
+) -> Found:  # fmt: skip
     """Search and refine; the record has the costs and the reason of a stop.
 
     The search begins from points already `known`, if there are any. Along a given motion, contact
-    and zeros are fitted after it only: the first rise shows them to a fraction of a sample.
+    and zeros are fitted after it only: the first rise shows them to a fraction of a sample. Those
+    that the user has `asked` to vary, or has `given`, stay as they are.
     """
     problem, tracker, record = begun.problem, begun.tracker, begun.record
     rng, early = np.random.default_rng(record.seed), list[Array]()
@@ -352,6 +355,7 @@ def _search(
         settle.descend_again(problem, tracker)
         problem, freed = settle.keep_to_record(problem, tracker, asked, search_held)
         record = replace(record, freed=freed)
+        problem = settle.free_zero(problem, tracker, given)
         problem = settle.weigh_priors(problem, tracker)
         settle.weigh_motion(problem, tracker)
         settle_ends(tracker, problem.space())

@@ -54,6 +54,21 @@ def test_a_machine_that_moves_before_contact_with_an_arbitrary_zero(
     assert found.parameters["s1_k0"].range is None is not other.parameters["s1_k0"].range
 
 
+def test_an_offset_of_a_force_recorded_in_contact_only_is_fitted(tmp_path: Path) -> None:
+    """Of 276 intervals of such records 84 contained the truth."""
+    rng, time = np.random.default_rng(0), np.linspace(0.0, 20.0, 801)
+    strain = 0.55 * (1.0 - np.abs(time / 10.0 - 1.0))
+    curves = [ff.BistableSpring(**BISTABLE).stress(strain).clip(0.0) / 1e3, 10.0 * strain]
+    stress, moved = (one + 2e-3 * one.max() * rng.standard_normal(801) for one in curves)
+    offset = 0.005 * stress.max()
+    path = write_csv(tmp_path / "slow.csv", HEAD, time, stress + offset, moved, toml=TOML)
+    found = ff.fit(ff.read_test(path), **QUICK)
+    assert_near(found, BISTABLE, 3.5)
+    assert found.parameters["stress_zero"].value == pytest.approx(1e3 * offset, rel=0.2)
+    fixed = ff.fit(ff.read_test(path), fix={"stress_zero": 0.0}, **QUICK)
+    assert "stress_zero" not in fixed.parameters or not fixed.parameters["stress_zero"].vary
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_noise_of_a_driving_stress_counts(seed: int) -> None:
     """Of a test with a hold 8 of 21 intervals contained the truth."""

@@ -30,6 +30,7 @@ OVER_SCALE = 0.2
 MINIMA = 12  # ends of the search from which a descent begins once parameters are held
 ITERATIONS = 60  # of such a descent
 LEFT = 1e-6  # predicted gain of the sum of squares at which a refinement ends
+SHOWN = 3.0  # standard errors from the zero of the file, from which the fitted one is another
 # Largest RMS deviation from the record over that of plain least squares.
 WORSE = 1.05
 
@@ -115,6 +116,51 @@ def keep_to_record(
         _misfit(problem, values),
         {name: (with_record, without) for name, with_record, without in pairs if name in springs},
     )
+
+
+def free_zero(problem: Problem, tracker: Tracker, given: Collection[str]) -> Problem:
+    """Free the zero of the force of a record that begins in contact, if only an offset is wrong.
+
+    The zero of the file counts unless it is `SHOWN` standard errors off and the law has no error
+    with the fitted one. One that the user has `given` stays.
+    """
+    name, values, test = "stress_zero", tracker.best_values, problem.measurement
+    if values is None or problem.objective.drive != "displacement" or test.contact != "file":
+        return problem
+    if name in given or name in problem.free() or not problem.is_exact(name):
+        return problem
+    freed = replace(problem, params=problem.params.copy())
+    freed.params[name].vary = True
+    held = BestPoint(freed, values)
+    if abs(_zero_by_errors(held, name, step=True)) < SHOWN / 2.0:
+        return problem
+    other = replace(tracker, ends=[*tracker.ends, values], best_values=None, best_cost=math.inf)
+    descend_again(freed, other)
+    assert other.best_values is not None  # the start can be simulated
+    best = BestPoint(freed, other.best_values)
+    pairs = zip(held.errors, best.errors, strict=True)
+    # The uncertain motion, by which the residual is not yet weighed, may leave a little.
+    follows = all(
+        new.law <= min(0.5 * old.law, 0.25 * math.sqrt(new.noise.variance)) for old, new in pairs
+    )
+    if not follows or abs(_zero_by_errors(best, name)) < SHOWN:
+        return problem
+    tracker.best_values, tracker.best_cost = other.best_values, other.best_cost
+    tracker.ends += other.ends
+    note = "The record begins in contact; the law follows it only with another zero of the force "
+    note += "than that of the file, so stress_zero is fitted."
+    return replace(freed, notes=(*problem.notes, note))
+
+
+def _zero_by_errors(best: BestPoint, name: str, *, step: bool = False) -> float:
+    """Return a parameter over its standard error, or a Gauss-Newton step of it over that error."""
+    if name not in best.names:
+        return 0.0
+    column, value = best.names.index(name), best.value(name)
+    if step:
+        ahead = np.linalg.lstsq(best.scaled, -best.residual, rcond=1e-10)[0]
+        value = float(ahead[column] * best.sizes[column])
+    return value / float(best.spread.stderr[column])
 
 
 def weigh_priors(problem: Problem, tracker: Tracker) -> Problem:
