@@ -322,9 +322,9 @@ def state(
 ) -> tuple[str, str]:
     """Return the state of a varied parameter whose branch was reached, and the reason.
 
-    It is determined if its 95 % interval and its range are within ±`WEAK` of its scale `size`, not
-    determined if one of them is wider than ±`NOTHING`, otherwise weak. `interval` is the wider of
-    the two (see `wider`), not cut at the limits; NaN where the data fix only a combination.
+    It is determined if both sides of its interval are within `WEAK` times its scale `size`, not
+    determined if the interval is wider than ±`NOTHING`, otherwise weak. `interval` is the wider of
+    95 % interval and range, not cut at the limits; NaN where the data fix only a combination.
     """
     ((low, high), what), of = interval, scale_in_words(name, value, size)
     half = 0.5 * (high - low)
@@ -337,5 +337,7 @@ def state(
     for limit in limits:
         if abs(value - limit) <= AT_LIMIT * size:
             return "weak", f"it lies at its limit {limit:g}; its interval is open on that side"
-    width = f"its {what} is ±{percent(ratio)} of {of}"
-    return "weak" if half > WEAK * size else "determined", width
+    width, far = f"its {what} is ±{percent(ratio)} of {of}", max(high - value, value - low)
+    if half <= WEAK * size < far:  # another minimum lies to one side
+        width = f"its {what} reaches {percent(far / size)} of {of} to one side"
+    return "weak" if far > WEAK * size else "determined", width
