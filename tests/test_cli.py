@@ -127,9 +127,7 @@ def test_json_is_all_there_is_and_the_seed_repeats(here: Path, fitted: tuple[Pat
     assert content == before
 
 
-def test_what_no_spring_follows_fails_and_is_written(
-    here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_fit_is_written(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small_pictures(monkeypatch)
     strain = np.concatenate([np.linspace(0, 0.4, 100), np.linspace(0.4, 0, 100)])
     stress = np.abs(np.random.default_rng(0).standard_normal(200))
@@ -322,9 +320,7 @@ def test_without_a_toml_all_that_is_missing_is_shown(
         ("t (ms),Stress (MPa),Way", {"displacement": "mm"}),
     ],
 )
-def test_init_asks_what_the_file_does_not_say(
-    here: Path, header: str, answers: dict[str, str]
-) -> None:
+def test_init_asks_for_the_rest(here: Path, header: str, answers: dict[str, str]) -> None:
     path = write(here, header, toml=None)
     told = accepted("init", path).stdout
     toml = path.with_suffix(".toml")

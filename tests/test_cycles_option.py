@@ -135,9 +135,7 @@ def lifted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Chain]:
     return write_csv(folder / "foam.csv", HEAD, t, force, moved, toml=TOML), chain
 
 
-def test_the_stress_between_cycles_is_the_zero_of_a_specimen_that_was_pressed(
-    lifted: tuple[Path, Chain],
-) -> None:
+def test_the_stress_between_cycles_is_the_zero(lifted: tuple[Path, Chain]) -> None:
     offset = 0.05 / AREA
     history = ff.read_test(lifted[0], cycles=(1, 2))
     assert history.origins["stress_zero"] == pytest.approx(offset, abs=50.0)

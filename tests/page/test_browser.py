@@ -347,9 +347,7 @@ def test_sliders_about_to_be_replaced_cannot_be_moved(window):
     assert window.evaluate("window.seen")
 
 
-def test_a_raw_file_is_drawn_prompts_for_its_specimen_and_offers_its_columns(
-    chromium, served, tmp_path
-):
+def test_a_raw_file_is_drawn_and_offers_its_columns(chromium, served, tmp_path):
     """A rheometer's export on a phone: no TOML, and a gap without a unit that counts down."""
     loop = np.sin(np.linspace(0.0, np.pi, 200))
     rows = [f"{0.005 * i:.3f},{2 * y:.4f},{10 - 4 * y:.5f}" for i, y in enumerate(loop)]

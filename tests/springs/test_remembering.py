@@ -235,9 +235,7 @@ def test_inner_loops_return_to_where_they_began(name: str, by_strain: bool) -> N
 @pytest.mark.parametrize("name", SPRINGS)
 @pytest.mark.parametrize("moved", [False, True])
 @pytest.mark.parametrize("count", [1, 2])
-def test_derivatives_in_closed_form_are_those_of_differences(
-    name: str, moved: bool, count: int
-) -> None:
+def test_derivatives_are_those_of_differences(name: str, moved: bool, count: int) -> None:
     """For prescribed stress and displacement, for one spring and with another one in series."""
     spring, heights = SPRINGS[name], [1e-3, 0.7e-3][:count]
     corners = np.array([0.0, 1.4, 0.31, 1.1, 0.23, 1.9, 0.05, 1.2, 0.52, 2.6, 0.41, 2.7, 0.0])

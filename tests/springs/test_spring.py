@@ -120,9 +120,7 @@ def test_branches_are_monotone_and_the_loop_takes_energy(spring: ff.BistableSpri
 
 @settings(max_examples=100, deadline=None)
 @given(admissible_springs())
-def test_partial_unloading_and_reloading_run_back_on_their_branch(
-    spring: ff.BistableSpring,
-) -> None:
+def test_partial_cycles_run_back_on_their_branch(spring: ff.BistableSpring) -> None:
     on_d = spring.eps_a + np.array([0.2, 0.9, 0.4, 0.7]) * (spring.eps_hat_c - spring.eps_a)
     want = spring.sigma_a + spring.kh_plus * (on_d - spring.eps_a)
     got = spring.stress([0.0, *on_d, spring.eps_a])

@@ -12,7 +12,6 @@ import fabricated
 import foamfit as ff
 from conftest import (
     DATA,
-    SPECIMEN,
     few_bytes,
     needs_data,
     run,
@@ -20,9 +19,8 @@ from conftest import (
     specimen_toml,
     thinned,
     without_pictures,
-    write_csv,
 )
-from cycled import FRESH, HEIGHT, ONSETS, SETS, write_record
+from cycled import ONSETS, SETS, write_record
 from foamfit.study import cycles as cycles_report
 
 
@@ -47,19 +45,6 @@ def test_each_cycle_is_fitted_from_its_own_contact(found):
     several = replace(found, results=dict.fromkeys(range(1, 9), found.results[1]))
     lines = [line for ax in cycles_report.plot_cycles(several).axes for line in ax.lines]
     assert sum(line.get_label() == "_measured" for line in lines) == 8
-
-
-def test_a_spring_that_stays_snapped_is_not_determined(tmp_path):
-    """Its next cycle follows branches e and c alone, as would other fresh springs."""
-    corners, goes = np.arange(0, 401, 100), [0.0, 0.38, 0.0, 0.38, 0.0]
-    strain = np.interp(t := np.arange(401.0), corners, goes)
-    stress = np.maximum(replace(FRESH, kh_minus=3e6).stress(strain), 0.0)
-    stress += 5e3 * np.random.default_rng(0).standard_normal(t.size)
-    columns, head = (t, stress, 1e3 * HEIGHT * strain), "time (s),stress (Pa),displacement (mm)"
-    path = write_csv(tmp_path / "a.csv", head, *columns, toml=SPECIMEN)
-    found = ff.fit_cycles(path, starts=4, intervals="local").results
-    assert "coincide" not in found[1].parameters["s1_k0"].why
-    assert "not snapped back" in found[2].parameters["s1_k0"].why
 
 
 def test_a_cycle_that_is_not_there_is_a_row_with_its_sentence(found):
