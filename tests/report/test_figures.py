@@ -14,7 +14,7 @@ import fabricated
 from conftest import run_refused
 from drawn import figures
 from foamfit.errors import InputError
-from foamfit.report.figures import BLUE, DPI, FITTED, SEEN, STYLE, images, inches
+from foamfit.report.figures import BLUE, DPI, SEEN, STYLE, VERMILION, images, inches
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def is_told(one: Any, other: Any) -> dict[str, float]:
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        (SEEN["color"], FITTED["color"]),
+        (SEEN["color"], VERMILION),
         (BLUE, "white"),  # hollow marks
     ],
 )

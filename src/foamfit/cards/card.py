@@ -23,10 +23,10 @@ from foamfit.errors import InputError
 from foamfit.files import check_file, write_file
 from foamfit.fitting.curves import driving_motion
 from foamfit.parts import law_in_words
-from foamfit.report import figures
-from foamfit.report.figures import BLUE, FITTED, SEEN, images
+from foamfit.report.figures import BLUE, SEEN, TWO, VERMILION, images
 from foamfit.report.folder import Result
-from foamfit.report.readable import readable_unit
+from foamfit.report.panels import Line, Panel
+from foamfit.report.plots import panelled
 from foamfit.report.render import environment, sentences
 from foamfit.results import Fit
 from foamfit.study.identified import read_source
@@ -37,9 +37,13 @@ from foamfit.text import percent, significant
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CARD: Any = {"color": BLUE, "linewidth": 1.0, "linestyle": (0, (5, 1.2)), "label": "card"}
-WIDTH, HEIGHT = 2.7, 2.6  # of a panel, inches
-MOST = 3  # records drawn: the slowest, the middle and the fastest
+# Labels and styles of the curves of a record.
+LOOKS: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("measured", SEEN),
+    ("fitted", {"color": VERMILION, "lw": 0.9}),
+    ("card", {"color": BLUE, "lw": 1.0, "ls": (0, (5, 1.2))}),
+)
+MOST = 2  # records drawn: the slowest and the fastest
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,28 +235,23 @@ def draw(card: Card) -> Figure:
     misfits = (f"{name} {percent(rms)}" for name, rms in card.misfit.items() if rms is not None)
     shown, curves = sorted(card.records, key=lambda one: one.rate or 0.0), card.curves
     if len(shown) > MOST:
-        shown = [shown[0], shown[len(shown) // 2], shown[-1]]
-    width = WIDTH * (len(shown) + 1)
+        shown = [shown[0], shown[-1]]
+    axes, panels = (("strain", "–"), ("stress", "Pa")), list[Panel]()
+    for one in shown:
+        pairs = ((one.strain, one.stress), (one.motion, one.fitted), (one.motion, one.card))
+        lines = [Line(*pair, *look) for pair, look in zip(pairs, LOOKS, strict=True)]
+        rate = "rate not known" if one.rate is None else f"{significant(one.rate, 3)} 1/s"
+        panels.append(Panel("record", *axes, lines, title=rate))
+    inside, lines = curves.measured, []
+    for shade, stress in zip(np.linspace(0.4, 1.0, len(curves.rates)), curves.stress, strict=True):
+        style = {"color": BLUE, "alpha": float(shade), "lw": 1.0}
+        lines.append(Line(curves.strain[:inside], stress[:inside], "_measured", style))
+        beyond = slice(inside - 1, None)
+        lines.append(Line(curves.strain[beyond], stress[beyond], "_beyond", style | {"ls": ":"}))
+    panels.append(Panel("loading", *axes, lines, title="loading; dotted: extrapolated"))
     about = f"{card.name} as {card.format}", f"misfit: {', '.join(misfits)}"
-    factor, unit = readable_unit(max(float(one.stress.max()) for one in shown), "Pa")
-    with figures.drawing(width, HEIGHT, *about) as figure:
-        axes = figure.subplots(1, len(shown) + 1)
-        for ax, one in zip(axes, shown, strict=False):
-            ax.plot(one.strain, one.stress / factor, **SEEN)
-            ax.plot(one.motion, one.fitted / factor, **FITTED)
-            ax.plot(one.motion, one.card / factor, **CARD)
-            rate = "rate not known" if one.rate is None else f"{significant(one.rate, 3)} 1/s"
-            ax.set(title=rate, xlabel="strain", ylabel=f"stress ({unit})")
-        ax, inside = axes[-1], curves.measured
-        factor, unit = readable_unit(float(curves.stress.max()), "Pa")
-        shades = np.linspace(1.0, 0.4, len(curves.rates))[::-1]
-        for shade, stress in zip(shades, curves.stress / factor, strict=True):
-            style: Any = {"color": BLUE, "alpha": float(shade), "linewidth": 1.0}
-            ax.plot(curves.strain[:inside], stress[:inside], **style)
-            ax.plot(curves.strain[inside - 1 :], stress[inside - 1 :], linestyle=":", **style)
-        ax.set(title="loading; dotted: extrapolated", xlabel="strain", ylabel=f"stress ({unit})")
-        figures.legend_below(figure, figures.named_in(axes))
-    return figure
+    with panelled(panels, TWO, *about) as (figure, _):
+        return figure
 
 
 @single_threaded

@@ -32,7 +32,8 @@ from foamfit.errors import InputError
 from foamfit.page.worker import Job, Worker, parsed
 from foamfit.report import figures
 from foamfit.report.described import describe
-from foamfit.report.panels import Line, Panel, draw
+from foamfit.report.panels import Line, Panel
+from foamfit.report.plots import panelled
 from foamfit.study.study_file import ENDINGS
 from foamfit.terminal import printable
 from foamfit.text import listed
@@ -360,11 +361,8 @@ def _picture(csv: Path, toml: Path, strained: bool) -> bytes:
         if x is not None:
             line = Line(x, test.stress, "", {"color": figures.BLUE, "lw": 0.9})
             panels.append(Panel(axis[0], axis, ("force", "N"), [line]))
-    with figures.drawing(7.0, 2.6) as figure:
-        axes = figures.grid_of(figure, 1, max(len(panels), 1), len(panels))
-        for ax, panel in zip(axes, panels, strict=True):
-            draw(ax, panel)
-    return figures.images(figure, "png", dpi=130)[0]
+    with panelled(panels, figures.TWO) as (figure, _):
+        return figures.images(figure, "png", dpi=130)[0]
 
 
 def remedies(message: str) -> dict[str, tuple[str, dict[str, Any]]]:

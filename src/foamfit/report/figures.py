@@ -22,9 +22,7 @@ Format = Literal["png", "pdf", "svg"]
 
 GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # palette of Okabe and Ito
 INSIDE = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # interior masses, from the base up
-# Measured and simulated curves of all small figures; also in greyscale one is darker.
-SEEN: Any = {"color": "0.65", "linewidth": 1.5, "label": "measured"}
-FITTED: Any = {"color": VERMILION, "linewidth": 0.9, "label": "fitted"}
+SEEN: Any = {"color": "0.65", "lw": 1.5}  # measured loops of small figures, also told in greyscale
 STYLE: Any = {  # matplotlib types its keys one by one
     "font.family": "DejaVu Sans",  # one upright font: each further font costs 0.1 s per PDF
     "font.size": 7.5,

@@ -53,6 +53,7 @@ class Panel:
     lines: list[Line]
     below: list[Line] = field(default_factory=list)
     below_name: str = "residual"
+    title: str = ""
 
     @property
     def is_loop(self) -> bool:
@@ -163,7 +164,7 @@ def draw(ax: Axes, panel: Panel) -> None:
             marked = evenly(x, y, MARKERS)
             x, y, style = x[marked], y[marked], {"ls": "none", **style}
         ax.plot(x, y, label=line.label, rasterized=x.size > MANY, **style)
-    ax.set(xlabel=x_label, ylabel=y_label, label=panel.name)
+    ax.set(xlabel=x_label, ylabel=y_label, label=panel.name, title=panel.title)
     ax.margins(0.05, 0.11)
 
 
