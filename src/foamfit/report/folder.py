@@ -19,7 +19,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.codec import plain
 from foamfit.errors import InputError
-from foamfit.files import csv_bytes, read_whole, reason, replacing
+from foamfit.files import csv_bytes, is_left, read_whole, reason, replacing
 from foamfit.report.figures import TWO, inches, write_both
 from foamfit.report.plots import figures_of
 from foamfit.report.readable import Readable
@@ -148,22 +148,23 @@ def save_somewhere(save: Callable[..., object], folder: Path, *, report: bool) -
     raise InputError(message)
 
 
-def check_target(folder: str | Path, *, of: str | None = None) -> None:
-    """Raise InputError unless `folder` is free, empty or an older result that may be replaced.
+def check_target(folder: str | Path, *, of: str | None = None, kept: bool = False) -> None:
+    """Raise InputError unless `folder` is free, or foamfit wrote all that is in it.
 
-    With `of`, one of `FILES`, only results of this kind may be replaced.
+    With `of`, one of `FILES`, only results of this kind may be replaced. A folder that is `kept`,
+    that of a batch, is not replaced: the folders of its tests are written into it.
     """
     folder = Path(folder)
     try:
         place = folder.resolve()
-        here = Path.cwd()
-        if place.exists() and any(place.samefile(at) for at in (here, *here.parents)):
-            raise InputError(
-                f"{folder} is or contains the current directory and cannot be replaced; choose a "
-                "separate folder"
-            )
         if place.is_dir():
-            _check_replaceable(folder, place, of)
+            if not kept:
+                _check_replaceable(folder, place, of)
+            if other := _foreign(place, kept):
+                raise InputError(
+                    f"{folder} holds {other}, which foamfit did not write, so it is kept; move "
+                    "that or choose another folder"
+                )
         elif os.path.lexists(place):
             raise InputError(f"{folder} is a file; choose a new or an empty folder")
         for path in (place, next(path for path in place.parents if path.exists())):
@@ -206,11 +207,16 @@ def check_same(folder: str | Path, data_sha256: str, options: Mapping[str, Any])
 
 def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
     """Raise InputError if the existing folder at `place` must not or cannot be replaced."""
+    here = Path.cwd()
+    if any(place.samefile(at) for at in (here, *here.parents)):
+        raise InputError(
+            f"{folder} is or contains the current directory and cannot be replaced; choose a "
+            "separate folder"
+        )
     if place.is_mount():
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
-    present = sorted(place.iterdir())
     kinds = [name for name in FILES if _content(place / name)]
-    if present and not kinds:
+    if any(place.iterdir()) and not kinds:
         raise InputError(
             f"{folder} is not empty and contains no foamfit result (such as fit.json), so it is "
             "not replaced; choose a new or an empty folder"
@@ -221,21 +227,28 @@ def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
             f"{folder} holds {other[0]}, which does not belong to a {Path(of).stem}, so it is "
             "not replaced; choose a new or an empty folder"
         )
-    tests = _content(place / "joint.json").get("tests")  # folders of a joint fit
-    for path in present:
-        if not is_written(path, tests if isinstance(tests, dict) else ()):
-            raise InputError(
-                f"{folder} holds {path.name}, which foamfit did not write, so it is not replaced; "
-                "move that or choose another folder"
-            )
 
 
-def is_written(path: Path, tests: Collection[str] = ()) -> bool:
+def _foreign(folder: Path, batch: bool) -> str:
+    """Return the first path in a folder that foamfit did not write, or ""."""
+    tests = _content(folder / "joint.json").get("tests")  # folders of a joint fit
+    for path in sorted(folder.iterdir()):
+        if batch and path.is_dir() and not path.is_symlink():
+            inside = [one.name for one in path.iterdir()]
+            foreign = [name for name in inside if not _is_written(path / name)]
+            if foreign or not any(name in FILES for name in inside):
+                return "/".join([path.name, *foreign[:1]])
+        elif not (batch and is_left(path.name)) and not _is_written(path, tests or ()):
+            return path.name
+    return ""
+
+
+def _is_written(path: Path, tests: Collection[str] = ()) -> bool:
     """Return whether foamfit writes such a path; `tests` are the folders of a joint fit."""
     if path.is_symlink():
         return False
     if path.is_dir() and (re.fullmatch(r"cycle-\d+", path.name) or path.name in tests):
-        return all(one.name in FILES["fit.json"] and is_written(one) for one in path.iterdir())
+        return all(one.name in FILES["fit.json"] and _is_written(one) for one in path.iterdir())
     return any(path.name in names for names in FILES.values()) and path.is_file()
 
 

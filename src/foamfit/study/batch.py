@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
 import threading
 import time
@@ -29,7 +28,7 @@ from foamfit.codec import build, plain
 from foamfit.data.csv_file import read_test
 from foamfit.data.toml_file import motion_file, toml_beside
 from foamfit.errors import InputError, SimulationError, check_whole
-from foamfit.files import is_left, read_whole, reason, sweep
+from foamfit.files import read_whole, reason, sweep
 from foamfit.fitting import nuisance
 from foamfit.fitting.problem import check_fixed_and_varied
 from foamfit.one_model import Options
@@ -37,14 +36,7 @@ from foamfit.options import Keywords
 from foamfit.parts import law_in_words
 from foamfit.report import listing as tables
 from foamfit.report.figures import TWO, inches
-from foamfit.report.folder import (
-    FILES,
-    check_target,
-    is_written,
-    save_whole,
-    write_json,
-    write_result,
-)
+from foamfit.report.folder import FILES, check_target, save_whole, write_json, write_result
 from foamfit.report.listing import REFUSED, Row, row_of
 from foamfit.results import stamp
 from foamfit.solve import precompile
@@ -260,7 +252,7 @@ def batch(
     folder = Path("fits", "batch", named) if out is None else Path(out)
     found, notify = find_tests(tests), progress or (lambda _: None)
     made = Batch(folder, recipe, found, toml, fresh, notify)
-    _check_out(folder)
+    check_target(folder, kept=True)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         sweep(folder.resolve(), [*(name for name, _ in found), *FILES["batch.json"]])
@@ -285,31 +277,6 @@ def _checked(model: str, options: Options) -> str:
     names = (*read.names, *nuisance.names_of(drive, time_shift=True))
     check_fixed_and_varied(names, read.name, options.fix or {}, options.vary)
     return read.name
-
-
-def _check_out(out: Path) -> None:
-    """Raise InputError unless foamfit may use the folder: it contains no files of others."""
-    if not out.is_dir():
-        check_target(out)
-        return
-    try:
-        for path in sorted(out.iterdir()):
-            name = path.name
-            if is_left(name) or (name in FILES["batch.json"] and path.is_file()):
-                continue
-            if path.is_dir() and not path.is_symlink():
-                inside = list(path.iterdir())
-                foreign = [inner.name for inner in inside if not is_written(inner)]
-                if not inside or (not foreign and any(inner.name in FILES for inner in inside)):
-                    continue
-                name = "/".join([name, *foreign[:1]])
-            raise InputError(
-                f"{out} holds {name}, which foamfit did not write; choose a new or an empty folder"
-            )
-        if not os.access(out, os.W_OK | os.X_OK):
-            raise PermissionError(0, f"Permission denied in {out.resolve()}")
-    except OSError as error:
-        raise InputError(f"{out} cannot be written: {reason(error)}") from None
 
 
 def _processes(recipe: Recipe, jobs: int | None, tests: int) -> Processes:
