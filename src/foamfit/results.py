@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -333,6 +333,16 @@ class Fit(OfLaw):
                 "ever_snapped": {n: float(one.ever[part][-1]) for n, one in snapping.items()},
             }
         return out
+
+    @property
+    def profiles(self) -> list[Profile]:
+        """The profiles, with times and zeros counted from those of the file, as `parameters`."""
+        found, origins = self.intervals.profiles if self.intervals else (), self.measurement.origins
+        moved = ((one, origins.get(one.name, 0.0)) for one in found)
+        return [
+            replace(one, values=one.values + by, ci95=(one.ci95[0] + by, one.ci95[1] + by))
+            for one, by in moved
+        ]
 
     @property
     def at_noise(self) -> bool | None:

@@ -307,9 +307,8 @@ def write_result(result: Fit, folder: Path, *, pages: bool = True, width: str = 
     write_table(folder / "parameters.csv", parameters)
     write_text(folder / "table.tex", parameters_tex(result.parameters))
     write_columns(folder / "curves.csv", result.columns)
-    if result.intervals is not None and result.intervals.profiles:
-        rows = (row for profile in result.intervals.profiles for row in profile.rows())
-        write_table(folder / "profiles.csv", rows)
+    if profiles := result.profiles:
+        write_table(folder / "profiles.csv", (row for one in profiles for row in one.rows()))
     if result.draws:
         samples: Any = result.draws  # NumPy types the names of arrays as its options
         np.savez(folder / SAMPLES, **samples)

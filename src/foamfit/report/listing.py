@@ -216,8 +216,8 @@ def table_of(results: Sequence[Row], top: Path) -> dict[str, Any]:
 
 
 def index_page(results: Sequence[Row], top: Path, title: str, counts: str, **more: Any) -> bytes:
-    """Return the page of a table of fits; `more` may have a picture, a CSV and `left_out`."""
-    given = {"picture": None, "csv": "", "left_out": False, "mark": MARK.decode()} | more
+    """Return the page of a table of fits; `more` may have a picture and a CSV."""
+    given = {"picture": None, "csv": "", "mark": MARK.decode()} | more
     text = page("index", title=title, counts=counts, table=table_of(results, top), **given)
     return text.encode("utf-8", errors="replace")
 
@@ -248,7 +248,6 @@ _STATUS = {
     REFUSED: "refused",
     OPEN: "not fitted yet",
 }
-MOST_ON_PAGE = 5000
 _MOST_REFUSALS = 20  # named on the terminal
 
 
@@ -350,9 +349,6 @@ def write_comparison(
 
 def write_page(rows: Sequence[Row], folder: Path, title: str, picture: bytes | None = None) -> None:
     """Write summary.html, a self-contained page, with a figure (SVG)."""
-    # Tests without a fit are always shown.
-    some = [row for i, row in enumerate(rows) if i < MOST_ON_PAGE or not row.has_fit]
-    shown = some[: 2 * MOST_ON_PAGE]
-    more: Any = {"picture": picture, "csv": "summary.csv", "left_out": len(shown) < len(rows)}
-    text = index_page(shown, folder, title, counts_in_words(rows), **more)
+    more: Any = {"picture": picture, "csv": "summary.csv"}
+    text = index_page(rows, folder, title, counts_in_words(rows), **more)
     write_file(folder / "summary.html", text)

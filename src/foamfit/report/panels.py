@@ -69,7 +69,8 @@ class Panel:
         """Return factor and axis label of x, then of y."""
         fx, x_unit = readable_unit(max(size(line.x) for line in self.lines), self.x[1])
         fy, y_unit = readable_unit(max(size(line.y) for line in self.lines), self.y[1])
-        return fx, f"{self.x[0]} ({x_unit})", fy, f"{self.y[0]} ({y_unit})"
+        x_label, y_label = f"{self.x[0]} ({x_unit})", f"{self.y[0]} ({y_unit})"
+        return fx, x_label.removesuffix(" ()"), fy, y_label.removesuffix(" ()")
 
 
 def is_known(result: Fit) -> bool:
@@ -202,13 +203,11 @@ POINTS = {"ad": "A1", "da": "A1", "dc": "C1", "ce": "C2", "ec": "C2", "ea": "A2"
 SIDES = ((-5.0, 4.0), (5.0, -4.0), (5.0, 4.0), (-5.0, -4.0))
 FARTHER = (1.0, 2.5, 4.0)
 LIGHT = {"a": 0.9, "c": 0.5}  # place of the name along an elastic branch, over its length
-STOOD = "#F2DC6B"  # standstill of the gauge
 
 
 def annotate(ax: Axes, panel: Panel, result: Fit, size: tuple[float, float]) -> None:
     """Add everything except the curves to a panel of about this size in points."""
     _mark_outliers(ax, panel, result)
-    _shade_standstills(ax, panel, result)
     labels = _Labels(ax, panel, size)
     if panel.is_loop:
         _draw_law(labels, result)
@@ -235,21 +234,6 @@ def _mark_outliers(ax: Axes, panel: Panel, result: Fit) -> None:
         y = np.clip(found.values / fy, low, high)
         ax.plot(x / fx, y, "x", label="outlier, not fitted", **style)
         ax.set_ylim(low, high)
-
-
-def _shade_standstills(ax: Axes, panel: Panel, result: Fit) -> None:
-    """Shade standstills of the gauge: a span of time, or a part of the measured loop."""
-    test = result.measurement
-    fx, _, fy, _ = panel.scale()
-    style: Any = {"color": STOOD, "zorder": 0.5, "label": "gauge stands still, bridged"}
-    for start, end in test.standstills:
-        if not panel.is_loop:
-            ax.axvspan(start / fx, end / fx, lw=0.0, **style)
-            continue
-        for line in panel.lines:
-            if line.kind == "measured":
-                at = (test.instants >= start) & (test.instants <= end)
-                ax.plot(line.x[at] / fx, line.y[at] / fy, lw=7.0, solid_capstyle="butt", **style)
 
 
 class _Labels:

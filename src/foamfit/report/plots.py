@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from foamfit.parts import ParameterEstimate
     from foamfit.results import Fit, Loop, Profile
     from foamfit.solve.simulation import Response
 
@@ -190,45 +190,43 @@ def figures_of(result: Fit, width: str = TWO) -> dict[str, Figure]:
 
 
 def plot_profiles(result: Fit) -> Figure | None:
-    """Draw each profile of the cost with its 95 % threshold and interval, four panels per row.
+    """Draw each profile of the cost with its 95 % threshold and interval; None without a profile.
 
-    The dashed parabola is that of the local covariance. Return None without a profile.
+    The dashed parabola is that of the local covariance.
     """
-    profiles = () if result.intervals is None else result.intervals.profiles
-    if not profiles:
+    panels = list[Panel]()
+    for one in result.profiles:
+        estimate = result.parameters[one.name]
+        name = one.name if one.complete else f"{one.name}, stopped"
+        lines = _profile_lines(one, estimate.stderr)
+        panels.append(Panel(one.name, (name, estimate.unit), ("rise of χ²", ""), lines))
+    if not panels:
         return None
-    rows = -(-len(profiles) // 4)
-    with figures.drawing(7.0, 0.55 + 1.55 * rows) as figure:
-        axes = figures.grid_of(figure, rows, 4, len(profiles), sharey=True)
-        for at, (ax, profile) in enumerate(zip(axes, profiles, strict=True)):
-            _draw_profile(ax, profile, result.parameters[profile.name])
-            ax.set_ylabel("rise of χ²", visible=at % 4 == 0)
-            ax.set_label(profile.name)
-        figures.legend_below(figure, figures.named_in(axes))
-    return figure
+    with panelled(panels, TWO) as (figure, _):
+        return figure
 
 
-def _draw_profile(ax: Axes, profile: Profile, estimate: ParameterEstimate) -> None:
-    factor, unit = readable_unit(float(np.max(np.abs(profile.values))), estimate.unit)
-    top = 2.0 * profile.cut
-    best = float(profile.values[np.argmin(profile.rises)])
-    x = profile.values / factor
-    ax.axhline(profile.cut, color=GREY, lw=0.6, ls=(0, (2, 2)), label="95 % threshold")
-    ax.axvspan(*(end / factor for end in profile.ci95), color="0.92", lw=0, label="95 % interval")
-    fine = np.linspace(x.min(), x.max(), 200)
-    if estimate.stderr:
-        parabola = ((fine * factor - best) / estimate.stderr) ** 2
-        below = np.where(parabola <= top, parabola, np.nan)
-        ax.plot(fine, below, color=GREY, lw=0.8, ls="--", label="local covariance")
-    root = np.sign(profile.values - best) * np.sqrt(np.maximum(profile.rises, 0.0))
-    style: Any = {"color": BLUE, "lw": 1.1, "label": "lowest cost, all others refitted"}
-    ax.plot(fine, np.interp(fine, x, root) ** 2, **style)
-    ax.plot(x, profile.rises, "o", color=BLUE, ms=2.2)
-    ax.plot(best / factor, 0.0, "o", color=VERMILION, ms=3.5, label="best fit")
-    ax.set_ylim(-0.04 * top, top)
-    ax.locator_params(axis="x", nbins=4)
-    name = f"{profile.name} ({unit})" if unit else profile.name
-    ax.set_xlabel(name if profile.complete else f"{name}, stopped", labelpad=1)
+def _profile_lines(profile: Profile, stderr: float | None) -> list[Line]:
+    """Return interval, threshold, parabola and cost, up to twice the threshold."""
+    values, rises, ends = profile.values, profile.rises, np.array(profile.ci95)
+    top, best = 2.0 * profile.cut, float(values[np.argmin(rises)])
+    fine = np.linspace(values.min(), values.max(), 200)
+    root = np.sign(values - best) * np.sqrt(np.maximum(rises, 0.0))
+    parabola = ((fine - best) / (stderr or np.nan)) ** 2
+    threshold = np.full_like(fine, profile.cut)
+    dots: dict[str, Any] = {"marker": "o", "ls": "none", "ms": 2.2, "color": BLUE}
+    lines = [
+        Line(fine, threshold, "95 % threshold", {"color": GREY, "lw": 0.6, "ls": (0, (2, 2))}),
+        Line(fine, parabola, "local covariance", {"color": GREY, "lw": 0.8, "ls": "--"}),
+        Line(fine, np.interp(fine, values, root) ** 2, "lowest cost, all others refitted",
+             {"color": BLUE, "lw": 1.1}),
+        Line(values, rises, "_samples", dots),
+        Line(np.array([best]), np.zeros(1), "best fit", dots | {"color": VERMILION, "ms": 3.5}),
+    ]  # fmt: skip
+    shown = (replace(one, y=np.where(one.y <= top, one.y, np.nan)) for one in lines)
+    shade: dict[str, Any] = {"color": "0.92", "lw": 0.0}
+    band = Line(ends, np.zeros(2), "95 % interval", shade, high=np.full(2, top))
+    return [band, *(one for one in shown if np.isfinite(one.y).any())]
 
 
 def plot_snapping(result: Fit) -> Figure | None:

@@ -51,7 +51,6 @@ from foamfit.text import counted
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_AHEAD = 1000  # tests submitted to the executor at a time
 PAUSE = 60.0  # least time between two summaries, s: of many tests, one takes seconds
 VERSION = version("foamfit")
 RECORD = "batch.json"  # in the folder of each test: its rows, and the fingerprint of their inputs
@@ -102,11 +101,8 @@ class Batch:
         try:
             for name, path in self.tests:
                 self._begin(executor, name, path)
-                self._collect(0.0)
-                while len(self.waiting) >= MOST_AHEAD:
-                    self._collect(1.0)
-            while self.waiting:
-                self._collect(1.0)
+            for future in futures.as_completed(self.waiting):
+                self._take(future)
         except BaseException as error:
             for future in self.waiting:
                 future.cancel()
@@ -131,18 +127,12 @@ class Batch:
             self._keep(name, tuple(replace(row, file=str(path)) for row in rows))
             return
         try:
-            self.waiting[executor.submit(work, task)] = task
+            future = executor.submit(work, task)
         except RuntimeError as error:  # the executor was shut down
             raise futures.BrokenExecutor(str(error)) from error
-
-    def _collect(self, seconds: float) -> None:
-        """Take finished fits, waiting up to the given time for one; update an old summary."""
-        done, _ = futures.wait(self.waiting, seconds, futures.FIRST_COMPLETED)
-        for future in [future for future in self.waiting if future in done]:
+        self.waiting[future] = task
+        if future.done():
             self._take(future)
-        if time.monotonic() - self.saved >= PAUSE:
-            self.save()
-            self.saved = time.monotonic()
 
     def _take(self, future: Future[tuple[Row, ...]]) -> None:
         task = self.waiting.pop(future)
@@ -164,6 +154,9 @@ class Batch:
         self.rows[name] = rows
         self.wrong += not all(row.has_fit for row in rows)
         self.progress(self)
+        if time.monotonic() - self.saved >= PAUSE:
+            self.save()
+            self.saved = time.monotonic()
 
 
 def batch(
