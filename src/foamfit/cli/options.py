@@ -34,7 +34,7 @@ def option(flag: str, text: str, kind: Any = None, **more: Any) -> Callable[[Com
     return click.option(*flag.split(), type=kind, help=text, **more)
 
 
-def _width(context: click.Context, parameter: click.Parameter, value: str) -> str:
+def _width(value: str) -> str:
     """Reject an invalid width before anything is computed."""
     if value not in ("one", "two"):  # these need no import
         from foamfit.report.figures import inches
@@ -54,12 +54,10 @@ def _range(text: str) -> tuple[int, int]:
     return int(first), int(last)
 
 
-def _cycles(
-    context: click.Context, parameter: click.Parameter, text: str | None
-) -> int | tuple[int, ...] | None:
+def _cycles(text: str) -> int | tuple[int, ...]:
     """Return the value of --cycle: a number, several numbers, or () for "all"."""
-    if text is None or text.strip().lower() == "all":
-        return None if text is None else ()
+    if text.strip().lower() == "all":
+        return ()
     parts = text.split(",")
     if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
         raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
@@ -88,7 +86,7 @@ def _fixes(
 # Options whose values the command parses by a rule of its own, not by their kind.
 READ: dict[str, dict[str, Any]] = {
     "specimen": {"type": FILE},
-    "cycle": {"type": str, "callback": _cycles},
+    "cycle": {"type": _cycles},
     "cycles": {"type": _range},
     "fix": {"type": str, "multiple": True, "callback": _fixes},
     "vary": {"type": str, "multiple": True},
@@ -111,9 +109,9 @@ WIDTH = option(
     "--figure-width",
     'Width of figures: one column (3.25 in), two (7 in), or a length like "85 mm". "two, untitled" '
     "omits titles.",
+    _width,
     default="two",
     metavar="one|two|LENGTH",
-    callback=_width,
 )
 
 

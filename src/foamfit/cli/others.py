@@ -261,7 +261,6 @@ def published() -> None:
     help="Cycle of a slow record. Default: the first.",
     type=options.COUNT,
     metavar="N",
-    callback=None,
 )
 @options.CYCLES
 @options.declared("drive", help="Default: the drive of the result.")

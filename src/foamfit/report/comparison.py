@@ -232,7 +232,7 @@ def published_side(name: str) -> Side:
 def _pair(side: Side, other: Side) -> Pair:
     about: dict[str, Any] = {"side": side, "other": other}
     nothing = words("incomparable", **about)
-    rows = (*_spring_rows(side, other, nothing), *_damping_rows(side, other, nothing))
+    rows = tuple(_rows(side, other, nothing))
     ratios = any("/" in row.label for row in rows)
     return Pair(side, other, rows, sentences("remarks", nothing=nothing, ratios=ratios, **about))
 
@@ -254,57 +254,46 @@ def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
             yield Compared(f"{param.symbol[0]}_{k}", param.unit, (f"{param.name}{k}",), _total)
 
 
-def _row(
-    label: str,
-    unit: str,
-    value: ParameterEstimate,
-    reference: ParameterEstimate | None,
-    about: tuple[Side, Side, str],
-    *,
-    eta: bool = False,
-) -> Row:
-    """Return a row; `about` are both sides and why nothing is compared, or ""."""
-    side, other, nothing = about
-    size = max(abs(one.value) for one in (value, reference) if one)
-    vague = VAGUE if reference and (value.stderr or 0.0) > NOTHING * size else ""
-    known: dict[str, Any] = {"value": value, "reference": reference, "side": side, "other": other}
-    remark = nothing or words("remark", eta=eta, vague=vague, **known)
-    return Row(label, unit, value, reference, remark)
+def _rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
+    """Yield the rows of the springs, then those of the damping of the striker's motion.
 
+    `nothing` says why nothing is compared, or is "". A dashpot of zero that no other value stands
+    beside has no row.
+    """
+    kinds, item, several = side.model.kinds, other.source, len(side.model.kinds) > 1
 
-def _spring_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
-    kinds, several = side.model.kinds, len(side.model.kinds) > 1
-    pairs = enumerate(zip(side.families, other.families, strict=False), start=1)
-    alike = {i for i, (own, theirs) in pairs if own == theirs}
+    def row(
+        label: str, one: Compared, names: list[str], theirs: list[str], *, eta: bool
+    ) -> Iterator[Row]:
+        value, reference = side.evaluate(names, one.formula), other.evaluate(theirs, one.formula)
+        always = not eta or (item is not None and one is damping)
+        if value is None or not (always or value.value or (reference and reference.value)):
+            return
+        size = max(abs(p.value) for p in (value, reference) if p)
+        vague = VAGUE if reference and (value.stderr or 0.0) > NOTHING * size else ""
+        known = {"value": value, "reference": reference, "side": side, "other": other}
+        remark = nothing or words("remark", eta=eta, vague=vague, **known)
+        yield Row(label, one.unit, value, reference, remark)
+
+    alike = [a == b for a, b in itertools.zip_longest(side.families, other.families)]
+    damping = Compared("η", "Pa·s", (), _total)
     for i, kind in enumerate(kinds, start=1):
         for one in _quantities(kind, side.model.relaxation):
-            eta = one.of == (ETA.name,)
-            names = [f"s{i}_{part}" for part in one.of]
-            value = side.evaluate(names, one.formula)
-            reference = other.evaluate(names, one.formula) if i in alike else None
-            # The damping of a single spring is shown with the onsite damper.
-            if value is None or (eta and not several):
-                continue
-            if not (eta and reference is None and (value.state, value.value) == ("fixed", 0.0)):
+            names, eta = [f"s{i}_{part}" for part in one.of], one.of == (ETA.name,)
+            if several or not eta:  # the damping of a single spring counts with the onsite damper
                 label = f"s{i} {one.label}" if several else one.label
-                yield _row(label, one.unit, value, reference, (side, other, nothing), eta=eta)
-
-
-def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
-    """Yield the damping of the striker's motion, and the damping ratio as defined in the paper."""
-    kinds, item = side.model.kinds, other.source
-    names = [n for n in ("site_eta", "s1_eta")[: 1 if len(kinds) > 1 else 2] if n in side.estimates]
+                yield from row(label, one, names, names if alike[i - 1] else [], eta=eta)
+    names = [n for n in ("site_eta", "s1_eta")[: 1 if several else 2] if n in side.estimates]
     same = [n for n in names if n in other.estimates] if item is None else ["site_eta"]
-    value, reference = side.evaluate(names, _total), other.evaluate(same, _total)
-    if value is None:
-        return
-    if item is None and value.value == 0.0 and not (reference and reference.value):
-        return
-    label = "site η" if len(kinds) > 1 else "η"
-    damping = _row(label, "Pa·s", value, reference, (side, other, nothing), eta=True)
-    yield damping
-    soft = [i for i, kind in enumerate(kinds, 1) if law(kind).hysteretic]
-    if item is None or len(soft) != 1 or nothing:
+    for found in row("site η" if several else "η", damping, names, same, eta=True):
+        yield found
+        yield from _damping_ratio(side, other, names, found) if item and not nothing else ()
+
+
+def _damping_ratio(side: Side, other: Side, names: list[str], damping: Row) -> Iterator[Row]:
+    """Yield the damping ratio as defined in the paper, for chains with one hysteretic spring."""
+    item, soft = other.source, [i for i, one in enumerate(side.model.laws, 1) if one.hysteretic]
+    if item is None or len(soft) != 1:
         return
     # The paper's ratio: ρ H = m/A, so that 2 H √(ρ k_c) = 2 √(m H k_c/A).
     inertia = item.striker_mass * item.chain.height / item.chain.area
@@ -314,8 +303,8 @@ def _damping_rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
     )
     if ratio is not None:
         # ζ is η over a square root, so it has the state of η unless k_c is undetermined.
-        unknown = ratio.state == "not determined" and value.state != "fixed"
-        ratio = replace(ratio, state=ratio.state if unknown else value.state)
+        unknown = ratio.state == "not determined" and damping.fitted.state != "fixed"
+        ratio = replace(ratio, state=ratio.state if unknown else damping.fitted.state)
         stated = None if item.damping_ratio is None else ParameterEstimate(item.damping_ratio)
         yield Row("ζ", "", ratio, stated, damping.remark)
 
