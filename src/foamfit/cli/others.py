@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -403,11 +404,7 @@ def card(result: Path, format: str, units: str, rates: str | None, out: Path | N
     options.compile_solver(False, source.model.name)
     made = cards.card(result, format=format, units=units, rates=asked)
     if out is None:
-        try:
+        with suppress(OSError):  # saving says that there is no such folder
             file.parent.mkdir(exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"{file.parent} cannot be made: {error.strerror}; give --out"
-            ) from None
     made.save(file)
     say(f"{made}\nwritten to {file}, with {file.name}.json, .png and .pdf beside it")

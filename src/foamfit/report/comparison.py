@@ -241,6 +241,9 @@ def _total(*parts: Any) -> Any:
     return sum(parts)
 
 
+DAMPING = Compared("η", "Pa·s", (), _total)  # of the striker's motion
+
+
 def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
     """Yield the compared quantities of a law: those of its record, or else each parameter."""
     own, hysteretic = law(kind), law(kind).hysteretic
@@ -254,38 +257,44 @@ def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
             yield Compared(f"{param.symbol[0]}_{k}", param.unit, (f"{param.name}{k}",), _total)
 
 
-def _rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
-    """Yield the rows of the springs, then those of the damping of the striker's motion.
+def _row(
+    label: str,
+    one: Compared,
+    names: tuple[list[str], list[str]],
+    about: tuple[Side, Side, str],
+    *,
+    eta: bool,
+) -> Iterator[Row]:
+    """Yield the row of a function of the parameters `names` of both sides.
 
-    `nothing` says why nothing is compared, or is "". A dashpot of zero that no other value stands
-    beside has no row.
+    `about` are both sides and why nothing is compared, or "". A dashpot of zero that no other value
+    stands beside has no row.
     """
-    kinds, item, several = side.model.kinds, other.source, len(side.model.kinds) > 1
+    side, other, nothing = about
+    value, reference = (s.evaluate(n, one.formula) for s, n in zip(about[:2], names, strict=True))
+    always = not eta or (other.source is not None and one is DAMPING)
+    if value is None or not (always or value.value or (reference and reference.value)):
+        return
+    size = max(abs(p.value) for p in (value, reference) if p)
+    vague = VAGUE if reference and (value.stderr or 0.0) > NOTHING * size else ""
+    known: dict[str, Any] = {"value": value, "reference": reference, "side": side, "other": other}
+    remark = nothing or words("remark", eta=eta, vague=vague, **known)
+    yield Row(label, one.unit, value, reference, remark)
 
-    def row(
-        label: str, one: Compared, names: list[str], theirs: list[str], *, eta: bool
-    ) -> Iterator[Row]:
-        value, reference = side.evaluate(names, one.formula), other.evaluate(theirs, one.formula)
-        always = not eta or (item is not None and one is damping)
-        if value is None or not (always or value.value or (reference and reference.value)):
-            return
-        size = max(abs(p.value) for p in (value, reference) if p)
-        vague = VAGUE if reference and (value.stderr or 0.0) > NOTHING * size else ""
-        known = {"value": value, "reference": reference, "side": side, "other": other}
-        remark = nothing or words("remark", eta=eta, vague=vague, **known)
-        yield Row(label, one.unit, value, reference, remark)
 
+def _rows(side: Side, other: Side, nothing: str) -> Iterator[Row]:
+    """Yield the rows of the springs, then those of the damping of the striker's motion."""
+    item, several, about = other.source, len(side.model.kinds) > 1, (side, other, nothing)
     alike = [a == b for a, b in itertools.zip_longest(side.families, other.families)]
-    damping = Compared("η", "Pa·s", (), _total)
-    for i, kind in enumerate(kinds, start=1):
+    for i, kind in enumerate(side.model.kinds, start=1):
         for one in _quantities(kind, side.model.relaxation):
             names, eta = [f"s{i}_{part}" for part in one.of], one.of == (ETA.name,)
             if several or not eta:  # the damping of a single spring counts with the onsite damper
                 label = f"s{i} {one.label}" if several else one.label
-                yield from row(label, one, names, names if alike[i - 1] else [], eta=eta)
+                yield from _row(label, one, (names, names * alike[i - 1]), about, eta=eta)
     names = [n for n in ("site_eta", "s1_eta")[: 1 if several else 2] if n in side.estimates]
     same = [n for n in names if n in other.estimates] if item is None else ["site_eta"]
-    for found in row("site η" if several else "η", damping, names, same, eta=True):
+    for found in _row("site η" if several else "η", DAMPING, (names, same), about, eta=True):
         yield found
         yield from _damping_ratio(side, other, names, found) if item and not nothing else ()
 

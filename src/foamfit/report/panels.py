@@ -340,28 +340,24 @@ def _name_branches(labels: _Labels, panel: Panel, result: Fit) -> None:
     springs, fitted = result.chain.springs, panel.fitted
     if len(springs) > 1 or not springs[0].law.hysteretic or fitted is None:
         return
-    for branch, stretch in _longest_visits(result, fitted).items():
+    ends = [0, *_switch_samples(result, fitted), fitted.x.size - 1]
+    at_rest = next(iter(springs[0].law.branches))
+    names = [switch.source for switch in result.switches[:1]] or [at_rest]
+    names += [switch.target for switch in result.switches]
+    visits = {name: (0.02 * float(np.ptp(fitted.x)), slice(0)) for name in names}
+    for name, start, end in zip(names, ends, ends[1:], strict=False):
+        span = float(np.ptp(fitted.x[start : end + 1])) if end > start else 0.0
+        if span > visits[name][0]:  # the longest; those below 2 % of the range are vibrations
+            visits[name] = span, slice(start, end + 1)
+    for name, (_, stretch) in visits.items():
         x, y = fitted.x[stretch] / labels.fx, fitted.y[stretch] / labels.fy
+        if not x.size:
+            continue
         middle = x[evenly(x, y, 3)[1]]
         inner = np.column_stack((x, y))[evenly(x, y, 9)]
         around = sorted(inner, key=lambda at: float(abs(at[0] - middle)))
         side = SIDES[1:2] if x[-1] < x[0] else SIDES[:1]  # below the curve on the way back
-        labels.write(branch, around, side, color=BLUE, fontsize=7.0, label="_on branch")
-
-
-def _longest_visits(result: Fit, fitted: Line) -> dict[str, slice]:
-    """Return the samples of the longest visit (in strain) of a single spring to each branch."""
-    ends = [0, *_switch_samples(result, fitted), fitted.x.size - 1]
-    at_rest = next(iter(result.chain.springs[0].law.branches))
-    branches = [switch.source for switch in result.switches[:1]] or [at_rest]
-    branches += [switch.target for switch in result.switches]
-    visits, longest = dict[str, slice](), dict[str, float]()
-    for branch, start, end in zip(branches, ends, ends[1:], strict=False):
-        span = float(np.ptp(fitted.x[start : end + 1])) if end > start else 0.0
-        # Shorter visits, below 2 % of the range of strain, are vibrations.
-        if span > longest.get(branch, 0.02 * float(np.ptp(fitted.x))):
-            visits[branch], longest[branch] = slice(start, end + 1), span
-    return visits
+        labels.write(name, around, side, color=BLUE, fontsize=7.0, label="_on branch")
 
 
 def _switch_samples(result: Fit, loop: Line) -> list[int]:

@@ -10,19 +10,6 @@ from foamfit.parts import ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
 from foamfit.text import number
 
-# Parameters that do not belong to a spring: symbol, index, and name in reports if it differs. The
-# parameters of springs are in the records of their laws.
-_OTHERS = {
-    "site_eta": ("η", "site", ""),
-    "contact_time": ("t", "0", "contact time t₀"),
-    "displacement_zero": ("w", "0", "motion zero w₀"),
-    "stress_zero": ("σ", "0", "stress zero σ₀"),
-    "acceleration_zero": ("a", "0", "acceleration zero a₀"),
-    "velocity": ("v", "0", "velocity v₀"),
-    "striker_mass": ("m", "", "striker mass m"),
-    "force_scale": ("s", "F", "force scale s_F"),
-    "time_shift": ("Δt", "", "time shift Δt"),
-}
 UNITS = {
     "Pa": ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa")),
     "s": ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")),
@@ -60,7 +47,7 @@ class Readable:
     @property
     def label(self) -> str:
         """The name in reports; for parameters of springs, the name in fit.json."""
-        return _OTHERS.get(self.name, ("", "", ""))[2] or self.name
+        return NUISANCE[self.name].what if self.name in NUISANCE else self.name
 
     @property
     def with_error(self) -> str:
@@ -122,9 +109,10 @@ def in_unit(values: Sequence[float], unit: str) -> str:
 def symbol(name: str) -> tuple[str, str]:
     """Return the symbol of a parameter and its index: k and "c,2" for s2_kc."""
     spring, short = split_name(name)
-    if name in _OTHERS or spring < 0:
-        stem, index, _ = _OTHERS.get(name, (name, "", ""))
-        return stem, index
+    if name in NUISANCE:
+        return NUISANCE[name].symbol
+    if spring < 0:
+        return ("η", "site") if name == "site_eta" else (name, "")
     stem, index = any_param(short).symbol
     term = short.removeprefix(family(short))  # number of the relaxation term
     return stem, ",".join(filter(None, (index, term, str(spring + 1))))

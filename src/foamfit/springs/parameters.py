@@ -14,17 +14,18 @@ from foamfit.springs import laws
 from foamfit.springs.laws import record
 from foamfit.springs.laws.record import COMMON, Law, Param
 
-# Nuisance parameters (see `fitting.nuisance`) and their units.
-NUISANCE = {
-    "contact_time": "s",
-    "displacement_zero": "m",
-    "stress_zero": "Pa",
-    "acceleration_zero": "m/s^2",
-    "velocity": "m/s",
-    "striker_mass": "kg",
-    "force_scale": "",
-    "time_shift": "s",
-}
+# Nuisance parameters (see `fitting.nuisance`): symbol, unit, and the name in reports.
+_NUISANCE = (
+    Param("contact_time", ("t", "0"), "s", "contact time t₀"),
+    Param("displacement_zero", ("w", "0"), "m", "motion zero w₀"),
+    Param("stress_zero", ("σ", "0"), "Pa", "stress zero σ₀"),
+    Param("acceleration_zero", ("a", "0"), "m/s^2", "acceleration zero a₀"),
+    Param("velocity", ("v", "0"), "m/s", "velocity v₀"),
+    Param("striker_mass", ("m", ""), "kg", "striker mass m"),
+    Param("force_scale", ("s", "F"), "", "force scale s_F"),
+    Param("time_shift", ("Δt", ""), "s", "time shift Δt"),
+)
+NUISANCE = {param.name: param for param in _NUISANCE}
 
 
 def relaxation_names(terms: int) -> tuple[str, ...]:
@@ -75,7 +76,7 @@ def any_param(short: str) -> Param:
 
 def unit_of(name: str) -> str:
     """Return the SI unit of a parameter; "" for a dimensionless one."""
-    return NUISANCE[name] if name in NUISANCE else any_param(split_name(name)[1]).unit
+    return (NUISANCE.get(name) or any_param(split_name(name)[1])).unit
 
 
 def direction(
