@@ -15,7 +15,7 @@ import time
 import tomllib
 import unicodedata
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -344,23 +344,26 @@ def preview(csv: Path, rest: str) -> Preview:
         return Preview()
     try:
         with tempfile.TemporaryDirectory() as folder:
-            toml = Path(folder, "test.toml")
-            toml.write_text(tomli_w.dumps(_document(rest) | UNIT), encoding="utf-8")
-            return Preview(headers, _picture(csv, toml, "strain" in source.columns))
+            toml, document = Path(folder, "test.toml"), _document(rest)
+            toml.write_text(tomli_w.dumps(document | UNIT), encoding="utf-8")
+            columns = {*source.columns, *document.get("columns", {})}
+            return Preview(headers, _picture(csv, toml, columns))
     except InputError as error:
         return Preview(headers, None, str(error))
 
 
-def _picture(csv: Path, toml: Path, strained: bool) -> bytes:
-    """Draw force over time and over the motion."""
+def _picture(csv: Path, toml: Path, columns: Collection[str]) -> bytes:
+    """Draw force or stress over time and over the motion, as `read_test` chooses them."""
     test, panels = read_test(csv, toml), list[Panel]()
     if test.stress is None:
         raise InputError("there is no force to draw")
+    pushed = ("stress", "Pa") if "stress" in columns else ("force", "N")
+    strained = "strain" in columns and "displacement" not in columns
     motion = ("strain", "–") if strained else ("displacement", "m")
     for x, axis in ((test.time, ("time", "s")), (test.displacement, motion)):
         if x is not None:
             line = Line(x, test.stress, "", {"color": figures.BLUE, "lw": 0.9})
-            panels.append(Panel(axis[0], axis, ("force", "N"), [line]))
+            panels.append(Panel(axis[0], axis, pushed, [line]))
     with panelled(panels, figures.TWO) as (figure, _):
         return figures.images(figure, "png", dpi=130)[0]
 
