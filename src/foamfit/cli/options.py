@@ -34,7 +34,7 @@ def option(flag: str, text: str, kind: Any = None, **more: Any) -> Callable[[Com
     return click.option(*flag.split(), type=kind, help=text, **more)
 
 
-def _width(value: str) -> str:
+def _width(context: click.Context, parameter: click.Parameter, value: str) -> str:
     """Reject an invalid width before anything is computed."""
     if value not in ("one", "two"):  # these need no import
         from foamfit.report.figures import inches
@@ -60,7 +60,7 @@ def _cycles(text: str) -> int | tuple[int, ...]:
         return ()
     parts = text.split(",")
     if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
-        raise InputError(f"--cycle {text!r} must be a number from 1 up, several as 1,2,10, or all")
+        raise click.BadParameter(f"{text!r} must be a number from 1 up, several as 1,2,10, or all")
     numbers = tuple(int(part) for part in parts)
     return numbers if len(numbers) > 1 else numbers[0]
 
@@ -109,9 +109,9 @@ WIDTH = option(
     "--figure-width",
     'Width of figures: one column (3.25 in), two (7 in), or a length like "85 mm". "two, untitled" '
     "omits titles.",
-    _width,
     default="two",
     metavar="one|two|LENGTH",
+    callback=_width,
 )
 
 
