@@ -165,8 +165,13 @@ def _numbers(one: contract.Compiled) -> tuple[int, ...]:
 
 
 @lru_cache(maxsize=1024)
-def lay_out(shape: Shape, integrated: bool = True) -> Layout:
-    """Lay out a run; `integrated` is whether it takes steps in time."""
+def lay_out(
+    laws: tuple[Law, ...], terms: int, ends: tuple[int, ...], top: int, damped: bytes,
+    directions_of: bytes, struck: bool, degree: int, integrated: bool = True,
+) -> Layout:  # fmt: skip
+    """Lay out a run, see `Shape`; `integrated` is whether it takes steps in time."""
+    solved = degree > 0 or not integrated
+    shape = Shape(laws, terms, ends, top, damped, directions_of, struck, degree, solved)
     made = [compiled(law) for law in shape.laws]
     directions = np.frombuffer(shape.directions, np.int64).reshape(-1, 2).tolist()
     count, groups, p = len(made), len(shape.ends), len(directions)

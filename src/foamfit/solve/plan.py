@@ -15,7 +15,7 @@ from foamfit.solve import cache, histories
 from foamfit.solve import scene as scenes
 from foamfit.solve.compiled import along, loop, rates, static
 from foamfit.solve.compiled.run import AT, POINTS
-from foamfit.solve.layout import Layout, Memory, Shape, lay_out
+from foamfit.solve.layout import Layout, Memory, lay_out
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
 from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
@@ -70,6 +70,12 @@ def _laws(records: tuple[Law, ...]) -> Laws:
     loose = tuple(i + 1 for i, law in enumerate(records) if law.kind == "unilateral")
     made = tuple(compiled(law) for law in records)
     return Laws(records, made, loose, any(one.kind == INTERNAL for one in made))
+
+
+@lru_cache(maxsize=64)
+def _of_explicit_impact(drag: float, speed: float, tol: float, most: int, followed: bool) -> Array:
+    """Return the numbers of explicit steps of an impact, see `loop`; they are only read."""
+    return np.array((drag, 1.0, speed, tol, most, 0.0, False, followed, 0.0, speed, 0.0, 0.0))
 
 
 class Plan(NamedTuple):
@@ -134,12 +140,10 @@ class Plan(NamedTuple):
         terms = self.terms
         if terms and not rows[:, 1 : 1 + 2 * terms : 2].any():  # no strength: as without terms
             terms = terms if (directions[:, 1] >= OWN_RELAXATION).any() else 0
-        solved = degree > 0 or not integrated
-        shape = Shape(
+        return lay_out(
             self.laws.records, terms, self.ends, self.top, damped, directions.tobytes(),
-            self.speed > 0.0, degree, solved,
+            self.speed > 0.0, degree, integrated,
         )  # fmt: skip
-        return lay_out(shape, integrated)
 
     def _slopes(self, rows: Array) -> Array:
         return slopes_of(self.laws.made, rows[:, 1 + 2 * self.terms :])
@@ -162,7 +166,7 @@ class Plan(NamedTuple):
         everything: bool, logged: int = LOGGED,
     ) -> Motion:  # fmt: skip
         """Integrate in time and log the switches, if there is room."""
-        stiff, damped = bool(self.implicit), (rows[:, 0] > 0.0).tobytes()
+        stiff, damped = bool(self.implicit), bytes([eta > 0.0 for eta in rows[:, 0].tolist()])
         if self.implicit is None and (drag or len(self.ends) > 1 or 1 in damped):
             vibrates, relaxes = self.fastest_rates(rows, heights, drag)
             stiff = vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION
@@ -222,6 +226,8 @@ class Plan(NamedTuple):
             brief = SHORT * lasts * (tol / 3e-8) ** (1.0 / 6.0)
         elif self.implicit is None:
             most = self.max_explicit
+        if not degree and self.speed > 0.0:
+            return _of_explicit_impact(drag, self.speed, tol, most, followed)
         scales = self._scales(rows, heights)
         return np.array((drag, 1.0, self.speed, tol, most, brief, over, followed, *scales))
 
@@ -272,7 +278,7 @@ class Plan(NamedTuple):
         self, out: Array, method: str, endings: Array, log: Array, rows: Array, lost: float
     ) -> Motion:
         """Return the result of a run as a Motion; raise SimulationError if it failed."""
-        outcome, time, steps, switches, finite, strongest = endings[: loop.FARTHEST].tolist()
+        outcome, time, steps, switches, finite, strongest, *_ = endings.tolist()
         if outcome != scenes.DONE or not finite:
             outcome = int(outcome) if outcome != scenes.DONE else scenes.NOT_FINITE
             loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
@@ -391,7 +397,7 @@ def plan(
         elif above == 0.0:
             top = scenes.VISCOUS if chain.site_damping > 0.0 else scenes.STRESS
     arrays, count, laws = chain.arrays, len(chain.springs), _laws(chain.laws)
-    masses, heavy = np.array((*arrays.inside, above / chain.area)), len(arrays.ends) > 1
+    masses, heavy = np.array([*arrays.inside, above / chain.area]), len(arrays.ends) > 1
     alone = top == scenes.MOTION and count == 1
     internal = laws.flowing and not (alone and laws.made[0].flows < FLOWS)
     damped = dashpots or arrays.damped or top == scenes.VISCOUS or internal

@@ -77,22 +77,22 @@ def _happened(c, i, kind):
 @inner
 def _root(c, low, high, i, kind):
     """Return where an excess becomes positive between two shares, by Illinois' method."""
+    look(c, high)  # where the values mostly belong to
+    s, f_high, side, dt, middle = spring(c, i), _excess(c, i, kind), 0, c.now.step, high
+    value, rate = f_high, s.rate
     look(c, low)
     f_low = _excess(c, i, kind)
-    look(c, high)
-    f_high, side = _excess(c, i, kind), 0
     if f_low >= 0.0:
         return low
-    s, value, dt, middle = spring(c, i), f_high, c.now.step, high
     for _ in range(60):
         if kind < TURN:  # Newton's method
-            middle -= value / ((s.rate if kind == TOP_END else -s.rate) * dt)
+            middle -= value / ((rate if kind == TOP_END else -rate) * dt)
         if kind >= TURN or not low < middle < high:
             middle = high - f_high * (high - low) / (f_high - f_low)
         if high - low <= 4e-16 or not low < middle < high:
             break
         look(c, middle)
-        value = _excess(c, i, kind)
+        value, rate = _excess(c, i, kind), s.rate
         if kind < TURN and abs(value) < 1e-15:
             return middle
         if value >= 0.0:

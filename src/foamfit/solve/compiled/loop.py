@@ -53,14 +53,15 @@ def _mend(c, y):
     """Bring what is integrated besides the state back to it: one step of Newton's method.
 
     So the stress of a BY_STRESS law stays that of its strain, and springs without a dashpot in one
-    group keep one stress.
+    group keep one stress. Return whether the state has changed.
     """
+    changed = False
     for g in range(c.none if not c.solved else c.groups, c.groups):
         i0, soft, mean, count = c.first[g], 0.0, 0.0, 0
         for i in range(i0, c.first[g + 1]):
             s, n = spring(c, i), numbers(c, i)
             if n.by_stress:
-                change = s.miss * s.slope
+                change, changed = s.miss * s.slope, True
                 y[n.x_at] -= change
                 s.total -= s.gain * change
             if s.eta == 0.0 and n.eps_at >= 0 and s.tangent > 0.0:
@@ -70,6 +71,7 @@ def _mend(c, y):
                 count -= c.count  # a flat branch takes the rest
         if count < 2:
             continue
+        changed = True
         for i in range(i0, c.first[g + 1]):
             s, n = spring(c, i), numbers(c, i)
             if s.eta == 0.0:
@@ -80,6 +82,7 @@ def _mend(c, y):
                 elif n.internal:
                     for k in range(n.internals):
                         y[n.x_at + k] += longer * s.by[2 + k]
+    return changed
 
 
 @inner
@@ -151,8 +154,8 @@ def _pass_event(c, want, share, who, kind):
     r.now += share * r.step
     r.grow = min(r.grow, 1.0)
     rates(c, y, c.stage, want, r.now)
-    _mend(c, y)
-    rates(c, y, c.stage, want, r.now)
+    if _mend(c, y):
+        rates(c, y, c.stage, want, r.now)
     if kind == events.RELEASE:
         return slope
     turns = spring(c, who).turns
