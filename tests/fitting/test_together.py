@@ -136,7 +136,7 @@ def test_the_slopes_of_every_kind_are_those_of_the_cost():
     }  # fmt: skip
     assert set(kinds.values()) == set(KINDS)
     links = Links(kinds, X, {"s1_kc": np.array([3.0, 5.0, 7.0])})
-    layout = engine._Layout.of(tuple(tests), links)
+    layout = engine.Layout.of(tuple(tests), links)
     point = layout.start(vectors(tests, changes))
     point = point + 0.01 * np.cos(np.arange(point.size)) * (np.abs(point) < 100.0)
     at = Iterate(point, layout.residual(point), layout.jacobian(point))

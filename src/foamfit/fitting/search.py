@@ -168,23 +168,23 @@ def descend(
 
 
 def halve(
-    tracker: Tracker,
-    space: Space,
+    functions: tuple[Callable[[Array], Array], Callable[[Array], levenberg.Jacobian]],
+    box: tuple[Array, Array],
     starts: Sequence[Array],
     step: Callable[[float], None] = lambda _: None,
 ) -> list[tuple[float, Array]]:
     """Descend from many starts by successive halving; return costs and coordinates of the ends.
 
     After each of the `STAGES` only the better part of the descents goes on (Jamieson & Talwalkar
-    2016, AISTATS 51, 240). `step` is called with the share that is done.
+    2016, AISTATS 51, 240). `functions` are the residual at a point of the `box` and its derivative.
+    `step` is called with the share that is done.
     """
-    functions, at = squares(tracker, space), list[levenberg.Iterate | Array](starts)
-    done, out = 0.0, list[levenberg.Iterate]()
+    at, done, out = list[levenberg.Iterate | Array](starts), 0.0, list[levenberg.Iterate]()
     for iterations, share, work in STAGES:
         out = []
         for i, one in enumerate(at):
             step(done + work * i / len(at))
-            out.append(levenberg.descend(*functions, one, space.box, iterations, enough=1e-5))
+            out.append(levenberg.descend(*functions, one, box, iterations, enough=1e-5))
         done += work
         out.sort(key=attrgetter("cost"))
         at = list(out[: max(math.ceil(share * len(starts)), min(LEAST, len(out)))])
@@ -371,7 +371,7 @@ def _descended(tracker: Tracker, space: Space, starts: list[Array]) -> list[floa
     springs are halved: on a slow mycelium test, halving misses the best minimum of one spring.
     """
     if has_several(space.model):
-        ends = halve(tracker, space, starts)
+        ends = halve(squares(tracker, space), space.box, starts)
     else:
         ends = [descend(tracker, space, start, 60) for start in starts]
     tracker.ends += [space.decode(end) for _, end in ends]
@@ -435,7 +435,8 @@ def _search_loop(
                 tracker.consider(inner.best_values)
                 tracker.look()
 
-        ends = halve(inner, own, spread_out(own, points, starts), step)
+        starting = spread_out(own, points, starts)
+        ends = halve(squares(inner, own), own.box, starting, step)
         ends = [(cost, space.encode(own.decode(end))) for cost, end in ends]
     finally:
         if inner.best_values is not None:

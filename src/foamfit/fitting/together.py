@@ -205,7 +205,7 @@ def fit_linked(
     returned. Raises InputError if the problems have different models, and SimulationError if no
     start can be simulated.
     """
-    layout = _Layout.of(tuple(problems), links)
+    layout = Layout.of(tuple(problems), links)
     functions = layout.residual, layout.jacobian
     ends = [
         levenberg.descend(*functions, start, layout.box, iterations, enough=ENOUGH)
@@ -217,15 +217,7 @@ def fit_linked(
             f"{problems[0].measurement.name}: no start of the fit of {len(problems)} tests can be "
             "simulated; give values that each test can be simulated with"
         )
-    best = min(ends, key=lambda end: end.cost)
-    parts = np.split(best.residual, np.cumsum([term.size for term in layout.terms])[:-1])
-    values = tuple(term.values(best.point) for term in layout.terms)
-    costs = tuple(
-        float(np.sum(part[: part.size - term.pulled.size] ** 2))
-        for part, term in zip(parts, layout.terms, strict=True)
-    )
-    shared, common = layout.shared, layout.common(best.point, values)
-    return Together(layout.problems, links, shared, layout.own, values, costs, common)
+    return layout.fitted(min(ends, key=lambda end: end.cost).point)
 
 
 def effective_samples(problem: Problem, values: Array) -> int:
@@ -275,7 +267,7 @@ def _spaces(problems: Sequence[Problem], absolute: tuple[str, ...]) -> list[Spac
 
 
 @dataclass(frozen=True, eq=False)
-class _Layout:
+class Layout:
     """The sum of squares of linked tests as a function of the coordinates (k,) of a box."""
 
     problems: tuple[Problem, ...]
@@ -286,7 +278,7 @@ class _Layout:
     box: tuple[Array, Array]
 
     @classmethod
-    def of(cls, problems: tuple[Problem, ...], links: Links) -> _Layout:
+    def of(cls, problems: tuple[Problem, ...], links: Links) -> Layout:
         """Assign indices to the coordinates: common ones first, then own ones test by test."""
         names = _varying(problems)
         kinds = {name: links.kind(name) for name in names}
@@ -328,6 +320,15 @@ class _Layout:
     def shared(self) -> tuple[str, ...]:
         """Names of the parameters determined by common values."""
         return tuple(name for name in self.common_places if name not in self.own)
+
+    def fitted(self, point: Array) -> Together:
+        """Return the tests at a point."""
+        values, costs = tuple(term.values(point) for term in self.terms), list[float]()
+        for term in self.terms:
+            own = term.residual_at(point)
+            costs.append(float(np.sum(own[: own.size - term.pulled.size] ** 2)))
+        shared, common = self.shared, self.common(point, values)
+        return Together(self.problems, self.links, shared, self.own, values, tuple(costs), common)
 
     def residual(self, point: Array) -> Array:
         """Return the stacked residuals of the tests; infinite for a failed simulation."""

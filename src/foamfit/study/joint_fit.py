@@ -20,16 +20,19 @@ from foamfit.data.calibration import contradictions
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import is_logarithmic
 from foamfit.fitting.links import RATES, Links
+from foamfit.fitting.minima import joint_minima
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import Tracker
 from foamfit.fitting.together import Together, fit_linked
 from foamfit.parts import ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 from foamfit.text import counted
-from foamfit.trust import covariance
-from foamfit.trust.best_point import BestPoint, JointPoint
+from foamfit.trust import covariance, say
+from foamfit.trust.best_point import BestPoint, Error, JointPoint
 from foamfit.trust.budget import judged, settle, unsettled
 from foamfit.trust.covariance import Ends
+from foamfit.trust.intervals import FAR, HARDLY_WORSE
+from foamfit.trust.profile import PLACED
 from foamfit.trust.ranges import ITERATIONS, TRIALS, left_open, nearer, tolerance
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
 from foamfit.trust.scatter import Spread, common_and_spread, correlation
@@ -58,6 +61,7 @@ class JointFit:
     ranges: Mapping[str, Ends] = field(default_factory=dict)  # See `ranges_of`
     own: tuple[Mapping[str, Ends], ...] = ()  # of each test, see `own_ranges`
     correlation: tuple[tuple[str, ...], Array] = ((), np.empty((0, 0)))  # See `correlation_of`
+    others: tuple[JointPoint, ...] = ()  # other minima, where noise alone decides between them
 
     @property
     def found(self) -> Together:
@@ -67,7 +71,7 @@ class JointFit:
 
 def fit_jointly(problems: Sequence[Problem], links: Links, starts: Sequence[Vectors]) -> JointFit:
     """Fit tests by `fitting.together.fit_linked` and find the uncertainty."""
-    found = fit_linked(problems, links, starts)
+    found, *minima = joint_minima(fit_linked(problems, links, starts))
     errors = errors_of(found)
     point, undrawn, spreads = JointPoint(found, errors), dict[str, Array](), dict[str, Spread]()
     scatter = [name for name in found.own if links.kind(name) == "scatter"]
@@ -83,7 +87,9 @@ def fit_jointly(problems: Sequence[Problem], links: Links, starts: Sequence[Vect
         point = JointPoint(found, errors, inflations)
     ranges = ranges_of(point)
     own = own_ranges(point, ranges)
-    return JointFit(point, spreads, ranges, own, correlation_of(point, undrawn))
+    minima = [] if scatter or point.uncertainty.errs else minima
+    others = tuple(JointPoint(one, errors) for one in minima)
+    return JointFit(point, spreads, ranges, own, correlation_of(point, undrawn), others)
 
 
 def _spread(point: JointPoint, name: str) -> tuple[Array, Spread, Array, Array] | None:
@@ -303,14 +309,14 @@ def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> ParameterE
     if kind == "scatter":
         return _scattering(fit, name, each)
     (value, *slope), span = found.common[name], fit.ranges.get(name)
-    one = _judged(fit, free[0], name, value, fit.point.of_common(name), span)
+    one = _judged(fit, free[0], name, span)
     why = f"one value for {counted(len(free), 'test')}: {one.why}"
     if not slope:
         return replace(one, why=why, kind=kind)
-    b, (error, freedom) = slope[0], fit.point.of_common(f"{name}:b")
-    half, why = covariance.half_width(error, freedom), f"at the rate of the median test; {why}"
+    b, error = slope[0], fit.point.of_common(f"{name}:b")
+    half, why = error.half, f"at the rate of the median test; {why}"
     if math.isfinite(half):
-        one = replace(one, b_stderr=error, b_ci95=(b - half, b + half))
+        one = replace(one, b_stderr=error.stderr, b_ci95=(b - half, b + half))
     b_range = fit.ranges.get(f"{name}:b")
     return replace(one, why=why, kind=kind, tests=each, b=b, b_range=b_range)
 
@@ -333,22 +339,41 @@ def _scattering(fit: JointFit, name: str, tests: dict[str, ParameterEstimate]) -
 
 
 def _judged(
-    fit: JointFit, test: int, name: str, value: float, error: Ends, span: Ends | None
+    fit: JointFit, test: int, name: str, span: Ends | None, *, own: bool = False
 ) -> ParameterEstimate:
-    """Judge a value by the wider of interval and range (`trust.covariance.RULE`).
+    """Judge the common value, or the `own` one of a `test`, by the wider of interval and range.
 
-    `error` contains standard error and degrees of freedom; limits and scale are those of `test`.
+    The rule is `trust.covariance.RULE`; limits and scale are those of the test. As in a fit of one
+    test, the interval extends to other minima that different noise could have made the best, and a
+    value far outside it at a minimum hardly worse leaves the parameter weak.
     """
-    problem, (stderr, freedom) = fit.found.problems[test], error
+
+    def at(point: JointPoint) -> tuple[float, Error]:
+        if own:
+            return point.bests[test].value(name), point.of_test(test, name)
+        return point.found.common[name][0], point.of_common(name)
+
+    problem, (value, error) = fit.found.problems[test], at(fit.point)
     low, high = limits = fit.point.bests[test].limits(name)
-    size = float(problem.sizes((name,), fit.found.values[test])[0])
-    half = covariance.half_width(stderr, freedom)
-    ends = (value - half, value + half)
+    size, unit = float(problem.sizes((name,), fit.found.values[test])[0]), unit_of(name)
+    ends, near = (value - error.half, value + error.half), list[float]()
+    for point in fit.others:
+        other, around = at(point)
+        rise = (point.found.cost - fit.found.cost) / (error.quantile**2 * error.inflation)
+        half = around.half * math.sqrt(max(1.0 - rise, 0.0))
+        wider = min(ends[0], other - half), max(ends[1], other + half)
+        if rise < 1.0 and np.ptp(wider) > (1.0 + PLACED) * np.ptp(ends):
+            ends = wider
+        near += [other] if rise <= HARDLY_WORSE**2 else []
     state, why = covariance.state(name, value, covariance.wider(ends, span), size, limits)
-    one = replace(_BLANK, value=value, unit=unit_of(name), state=state, why=why, range=span)
-    if not half <= covariance.NOTHING * size:
+    far = [x for x in near if max(ends[0] - x, x - ends[1]) > FAR * np.ptp(ends)]
+    if state == "determined" and far:
+        there = far[0] + problem.measurement.origins.get(name, 0.0)
+        state, why = "weak", say("why", "elsewhere", why=why, unit=unit, there=there)
+    one = replace(_BLANK, value=value, unit=unit, state=state, why=why, range=span)
+    if not np.ptp(ends) <= 2.0 * covariance.NOTHING * size:
         return one
-    return replace(one, stderr=stderr, ci95=(max(ends[0], low), min(ends[1], high)))
+    return replace(one, stderr=error.stderr, ci95=(max(ends[0], low), min(ends[1], high)))
 
 
 def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, ParameterEstimate]:
@@ -365,7 +390,6 @@ def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, Param
             why = f"branch {branch} was never reached"
             one = replace(one, state="not determined", why=why)
         else:
-            error, span = fit.point.of_test(t, name), fit.own[t].get(name)
-            one = _judged(fit, t, name, one.value, error, span)
+            one = _judged(fit, t, name, fit.own[t].get(name), own=True)
         out[test] = one.counted_from(-problem.measurement.origins.get(name, 0.0))
     return out

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,24 @@ from foamfit.trust.residuals.noise_process import basis_of
 
 # Largest leverage of a cycle along a direction; at 1 its residual would be zero there.
 MOST_TAKEN = 0.99
+
+
+class Error(NamedTuple):
+    """Standard error, degrees of freedom, and variance over that under unit white noise."""
+
+    stderr: float
+    freedom: float
+    inflation: float
+
+    @property
+    def quantile(self) -> float:
+        """Student's t of the 95 % interval."""
+        return covariance.half_width(1.0, self.freedom)
+
+    @property
+    def half(self) -> float:
+        """Half of the local 95 % interval."""
+        return self.quantile * self.stderr
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,26 +318,27 @@ class JointPoint:
                 variances.append(float(self.inflations[name][t]) if self.inflations else 1.0)
         return (np.array(rows), np.array(variances)) if rows else None
 
-    def of_common(self, name: str) -> tuple[float, float]:
-        """Return standard error and degrees of freedom of a common unknown; NaN for others."""
+    def of_common(self, name: str) -> Error:
+        """Return the error of a common unknown; NaN for others."""
         return self._of_sum(np.array([common == name for common in self.names], dtype=float))
 
-    def of_test(self, test: int, name: str) -> tuple[float, float]:
-        """Return standard error and degrees of freedom of a test's parameter; NaN if unreached."""
+    def of_test(self, test: int, name: str) -> Error:
+        """Return the error of a test's parameter; NaN if unreached."""
         best = self.bests[test]
         if name not in best.names:
-            return math.nan, 1.0
+            return Error(math.nan, 1.0, 1.0)
         i = best.names.index(name)
         row = self.uncertainty.blocks[test].through[i] * best.sizes[i] / self._scales
         return self._of_sum(row)
 
-    def _of_sum(self, row: Array) -> tuple[float, float]:
-        """Return standard error and degrees of freedom of a weighted sum of unknowns."""
+    def _of_sum(self, row: Array) -> Error:
+        """Return the error of a weighted sum of unknowns."""
         if not (at := np.flatnonzero(row)).size:
-            return math.nan, 1.0
-        covariance = self.uncertainty.covariance
+            return Error(math.nan, 1.0, 1.0)
+        covariance, first = self.uncertainty.covariance, at[0]
         variance = row[at] @ covariance.matrix[np.ix_(at, at)] @ row[at]
-        return float(np.sqrt(variance)), float(covariance.freedom[at[0]])
+        freedom, inflation = covariance.freedom[first], covariance.inflation[first]
+        return Error(float(np.sqrt(variance)), float(freedom), float(inflation))
 
     def reach(self, name: str) -> float:
         """Return the change of a shared value that raises the cost by 1; 0 if undetermined."""
