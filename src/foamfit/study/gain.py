@@ -253,8 +253,12 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
     noise, law = (np.diagonal(one, axis1=1, axis2=2) for one in covariance(known, seen))
     halves, ranges = NORMAL * np.sqrt(noise), np.sqrt(np.maximum(law, 0.0))
     wider, places = np.maximum(halves, ranges), [known.problem.index[n] for n in known.names]
-    shares, wide = halves / known.drawn_sizes, wider / known.drawn_sizes
-    clear = np.abs(known.draws[:, places]) / known.sizes > wider
+    values, wide = known.draws[:, places] / known.sizes, wider / known.drawn_sizes
+    clear, limits = np.abs(values) > wider, [known.problem.params[n] for n in known.names]
+    least, most = np.array([(one.min, one.max) for one in limits]).T / known.sizes
+    # As in a fit, an interval ends at the limits of its parameter.
+    widths = np.minimum(values + halves, most) - np.maximum(values - halves, least)
+    shares = 0.5 * widths / known.drawn_sizes
     reached = np.broadcast_to(known.reached, halves.shape)
     for one in seen:
         reached = reached | one.reached
@@ -267,7 +271,7 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
         state = "determined" if chance >= 0.5 else "weak" if some >= 0.5 else "not determined"
         ends, share = np.full(3, math.nan), math.nan
         if state != "not determined":
-            ends = 2.0 * known.sizes[i] * np.quantile(halves[shown, i], (0.1, 0.5, 0.9))
+            ends = known.sizes[i] * np.quantile(widths[shown, i], (0.1, 0.5, 0.9))
             share = float(np.median(shares[shown, i]))
         low, middle, high = ends.tolist()
         out[name] = Expected(middle, state, (low, high), chance, share)
