@@ -20,7 +20,8 @@ SPRING = {
     "k0": 5.5e5, "kc": 4e5, "eps_star": 0.3, "sigma_plus": 1.1e5, "spread_plus": 0.4,
     "sigma_minus": 7e4, "spread_minus": 0.6,
 }  # fmt: skip
-NOISE = 400.0
+NOISE, RATES = 400.0, (0.01, 0.1, 1.0)
+NAMES = [f"s1_{name}" for name in SPRING]
 HEAD = "time (s),stress (Pa),displacement (mm)"
 
 
@@ -42,9 +43,6 @@ def write_study(folder: Path, parameters: str, more: str = "") -> Path:
         f'specimen = "foam.toml"\nstarts = 2\n{more}\n[parameters]\n{parameters}\n'
     )
     return folder / "study.toml"
-
-
-RATES = (0.01, 0.1, 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -234,9 +232,6 @@ def test_a_noisy_test_does_not_dominate(tmp_path):
     assert shares == pytest.approx([0.25] * 4, abs=0.06)
     one = result.parameters["s1_k0"]
     assert abs(one.value - SPRING["k0"]) < 4.0 * one.stderr
-
-
-NAMES = [f"s1_{name}" for name in SPRING]
 
 
 def test_drives_and_noise_mix(tmp_path):
