@@ -8,12 +8,14 @@ best point, or show what the test leaves undetermined.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from operator import attrgetter
 
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.errors import SimulationError
 from foamfit.fitting.box import Space
 from foamfit.fitting.levenberg import Iterate, following
 from foamfit.fitting.nuisance import CONTACT_TIME
@@ -133,7 +135,8 @@ def exchange_springs(tracker: Tracker, space: Space) -> None:
 def joint_minima(found: Together) -> list[Together]:
     """Return the minima of a joint fit that noise could make the best, cheapest first.
 
-    Branches of springs in series are exchanged as in `exchange_springs`, in all tests alike.
+    Branches of springs in series are exchanged as in `exchange_springs`, in all tests alike, and
+    the springs put in order, if that changes no curve of any test.
     """
     problems, links, model = found.problems, found.links, found.problems[0].model
     if not has_several(model):
@@ -166,11 +169,12 @@ def joint_minima(found: Together) -> list[Together]:
         for cost, point in halve((thin.residual, thin.jacobian), thin.box, starts):
             if cost > least + nearly or _among(met, point):
                 continue
-            other = settled([term.values(point) for term in thin.terms])
-            met += [point, at := thin.start(other.values)]
-            if not _among(met[:-2], at):
-                ends.append(other)
-                left.append(other)
+            with suppress(SimulationError):  # the thinned record was simulated
+                other = settled([term.values(point) for term in thin.terms])
+                met += [point, at := thin.start(other.values)]
+                if not _among(met[:-2], at):
+                    ends.append(other)
+                    left.append(other)
     best = min(end.cost for end in ends)
     return sorted((end for end in ends if end.cost <= best + near), key=attrgetter("cost"))
 
