@@ -258,7 +258,7 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
     least, most = np.array([(one.min, one.max) for one in limits]).T / known.sizes
     # As in a fit, an interval ends at the limits of its parameter.
     widths = np.minimum(values + halves, most) - np.maximum(values - halves, least)
-    shares = 0.5 * widths / known.drawn_sizes
+    shares = halves / known.drawn_sizes
     reached = np.broadcast_to(known.reached, halves.shape)
     for one in seen:
         reached = reached | one.reached

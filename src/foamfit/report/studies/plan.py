@@ -39,8 +39,8 @@ class Expected:
     """What is expected of a parameter: 95 % interval and state.
 
     `ci95_width` is the median width of the interval over the draws (SI; NaN where it is unknown),
-    and `ci95_width_10_90` their 10 and 90 % quantiles. `share` is half of it over the scale of the
-    parameter, and `probability` that with which the parameter is determined.
+    and `ci95_width_10_90` their 10 and 90 % quantiles. `share` is half of it, not cut at limits,
+    over the scale of the parameter, and `probability` that with which the parameter is determined.
     """
 
     ci95_width: float
