@@ -25,7 +25,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 DRIVES = ("impact", "stress", "displacement")
 METHODS = ("auto", "local", "profile", "mcmc")  # of the intervals
 # Start points per spring, per spring if several are hysteretic, and the largest number in all.
-STARTS, STARTS_IN_SERIES, MOST_STARTS = 16, 48, 100_000
+STARTS, STARTS_IN_SERIES, MOST_STARTS = 16, 24, 100_000
 MOST_TERMS = 10  # relaxation terms
 DRAWS, LEAST_DRAWS, MOST_DRAWS = 2000, 100, 100_000  # steps of a Markov chain
 

@@ -20,7 +20,7 @@ from foamfit.fitting.box import Space
 from foamfit.fitting.levenberg import Iterate, following
 from foamfit.fitting.nuisance import CONTACT_TIME
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.search import MISSING, Tracker, descend, halve, has_several, rank, squares
+from foamfit.fitting.search import Tracker, descend, halve, has_several, rank, squares
 from foamfit.fitting.together import Layout, Together, fit_linked
 from foamfit.springs.laws.record import Law
 from foamfit.springs.model import exchanges
@@ -28,9 +28,6 @@ from foamfit.springs.parameters import relaxation_names, split_name
 
 # Largest number of minima from which springs are exchanged, and of descents from each but the best.
 EXCHANGES, EXCHANGED = 8, 16
-# Above the noise floor: springs of another end are exchanged if its cost is higher by at most this
-# fraction.
-DETOUR = 0.5
 # Ends of the search within NEAR noise variances of the best cost are refined, at most MINIMA of
 # them. Points of the box closer than SAME are one minimum.
 NEAR, MINIMA, SAME = 40.0, 24, 0.02
@@ -112,9 +109,7 @@ def exchange_springs(tracker: Tracker, space: Space) -> None:
     open_ends = [(tracker.best_cost, tracker.best_values)]
     for _ in range(EXCHANGES):
         best = tracker.best_cost
-        # Above the noise floor the true springs, if there are any, have not been found yet.
-        detour = DETOUR * best if best > MISSING * objective.floor else 0.0
-        open_ends = [end for end in open_ends if end[0] <= best + max(_near(objective), detour)]
+        open_ends = [end for end in open_ends if end[0] <= best + _near(objective)]
         if not open_ends:
             break
         at = min(range(len(open_ends)), key=lambda i: open_ends[i][0])

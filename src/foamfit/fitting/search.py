@@ -19,10 +19,10 @@ from foamfit.arrays import Array
 from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
 from foamfit.fitting.objective import Objective
+from foamfit.fitting.series import ALIKE, Functions, cross, elongations, grouped
 from foamfit.fitting.starts import (
     CURVE_STARTS,
     Reading,
-    Start,
     apart,
     around,
     box_starts,
@@ -40,23 +40,21 @@ PULSE = 16  # evaluations between two calls of `Tracker.pulse`
 # Fractions of the run time of a search at which its parts begin, as measured.
 DESCENTS, ON_CURVES, REFINED = 0.25, 0.75, 0.95
 # Largest number of rounds: a second one if only one descent led to the best end, and a third if its
-# cost is still above the noise floor; one more for several hysteretic springs.
+# cost is still above the noise floor.
 ATTEMPTS = 3
-IN_SERIES = 3  # least number of rounds for several hysteretic springs
+FOUND_AGAIN = 0.02  # relative difference of the costs of descents that agree on the best end
 LOST = 30.0  # cost, in noise floors, above which a second round always follows
 NOISY = 0.005  # noise of a motion, as a fraction of its range, above which it is smoothed
 # Points beside the best one are tried if the cost exceeds this fraction of the noise floor.
 MISSING = 0.8
 # They are tried again if the cost has fallen by more than this fraction.
 NEWS = 1e-5
-ALIKE = 1e-3  # relative difference of the costs of descents that ended in one minimum
 # Minima of the loop are continued if their cost on the curves is within this factor of the best.
 PROMISING = 100.0
 # Stages of successive halving: iterations, the share of the starts that then goes on, and that of
 # the work.
 STAGES = ((8, 0.5, 0.5), (8, 0.25, 0.25), (24, 0.25, 0.25))
 HALFWAY = STAGES[0][2]
-ADJUSTED = 24  # starts of springs in series whose places are adjusted
 LEAST = 6  # descents that go on in any case
 FEWER = 4  # divisor of the number of starts if a poorer model has found good ones
 
@@ -110,8 +108,13 @@ class SearchRecord:
 
     @property
     def agreeing(self) -> int:
-        """Number of descents that led to the best cost, within 2 %."""
-        return sum(count for cost, count in self.costs if cost <= 1.02 * self.costs[0][0])
+        """Number of descents that led to the best cost; see `_agreeing`."""
+        return _agreeing(self.costs)
+
+
+def _agreeing(ends: Sequence[tuple[float, int]]) -> int:
+    """Return the number of descents that led to the best cost, within 2 %."""
+    return sum(count for cost, count in ends if cost <= (1.0 + FOUND_AGAIN) * min(ends)[0])
 
 
 @dataclass(eq=False)
@@ -193,7 +196,7 @@ def halve(
 
 def squares(
     tracker: Tracker, space: Space, rows: slice | NDArray[np.bool_] = slice(None)
-) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+) -> Functions:
     """Return functions for some rows of the residual at a point of the box, and its derivative."""
 
     def residual(point: Array) -> Array:
@@ -212,36 +215,6 @@ def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[floa
     return sorted(
         ((float(r @ r), p) for r, p in zip(residuals, points, strict=True)), key=itemgetter(0)
     )
-
-
-def start_points(
-    tracker: Tracker, points: list[Array], reading: Reading, rng: np.random.Generator
-) -> list[tuple[float, Array]]:
-    """Return points and starts read off the loop with their costs, cheapest first.
-
-    Springs in series share the loop, so the right places of all of them are rarely drawn at once:
-    in the best of these starts one place after the other is adjusted.
-    """
-    space, read = reading.space, reading.starts(rng)
-    ranked = rank(tracker, space, points + [one.point for one in read])
-    if has_several(space.model):
-        known = {id(one.point): one for one in read if one.in_series}
-        best = [(cost, known[id(point)]) for cost, point in ranked if id(point) in known]
-        ranked += [adjusted(tracker, reading, one, rng) for one in best[:ADJUSTED]]
-    return sorted(ranked, key=itemgetter(0))
-
-
-def adjusted(
-    tracker: Tracker, reading: Reading, start: tuple[float, Start], rng: np.random.Generator
-) -> tuple[float, Array]:
-    """Return cost and point of a start after each of its marks was moved to the best place."""
-    cost, best = start
-    for at in rng.permutation(reading.size):
-        for other in reading.others(best, int(at)):
-            residual = tracker.residual(reading.space.decode(other.point))
-            if (found := float(residual @ residual)) < cost:
-                cost, best = found, other
-    return cost, best.point
 
 
 def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
@@ -265,13 +238,7 @@ def distinct(ends: list[tuple[float, Array]]) -> list[tuple[int, Array]]:
 
     Ends belong to one minimum if the relative difference of their costs is below `ALIKE`.
     """
-    groups: list[list[tuple[float, Array]]] = []
-    for end in sorted(ends, key=itemgetter(0)):
-        if groups and end[0] <= (1.0 + ALIKE) * groups[-1][0][0]:
-            groups[-1].append(end)
-        else:
-            groups.append([end])
-    return [(len(group), group[0][1]) for group in groups]
+    return [(len(group), group[0][1]) for group in grouped(ends, ALIKE)]
 
 
 def search(
@@ -292,9 +259,9 @@ def search(
     if known:
         points, starts = points + given, max(starts // FEWER, LEAST)
     out: list[tuple[float, int]] = []
-    several = has_several(space.model)
-    attempts, edges, left = 1 if known else ATTEMPTS + several, list[float](), np.inf
+    attempts, edges, left = 1 if known else ATTEMPTS, list[float](), np.inf
     for attempt in range(attempts):
+        before = tracker.best_cost
         counts: dict[int, int] = {}
         if tracker.objective.measurement.displacement is not None:
             found = distinct(_search_loop(tracker, space, points, starts, rng, progress))
@@ -319,8 +286,7 @@ def search(
             edges, more = leave_minimum(tracker, space, new=not known)
             out += more
             left = tracker.best_cost
-        least = IN_SERIES if several else max(attempts // 2, 2 if edges else 1)
-        if attempt + 1 == attempts or _settled(tracker, out, attempt, least):
+        if attempt + 1 == attempts or _settled(tracker, out, attempt, 2 if edges else 1, before):
             break
         points = box_starts(space, rng, CURVE_STARTS // 3)
         if tracker.best_values is not None:
@@ -378,20 +344,24 @@ def _descended(tracker: Tracker, space: Space, starts: list[Array]) -> list[floa
     return [cost for cost, _ in ends]
 
 
-def _settled(tracker: Tracker, ends: list[tuple[float, int]], attempt: int, least: int) -> bool:
-    """Return whether no further round is needed.
+def _settled(
+    tracker: Tracker, ends: list[tuple[float, int]], attempt: int, least: int, before: float
+) -> bool:
+    """Return whether no further round is needed; `before` is the best cost of earlier ones.
 
     Several descents must agree on the best end, or after a second round its cost must be at the
-    noise floor. `least` rounds are made if the best end is above the noise floor or several springs
-    are hysteretic, and two if it is far above.
+    noise floor. `least` rounds are made if the best end is above the noise floor, and two if it is
+    far above. The ends of springs in series that were combined are no independent ones: there a
+    round with new starts must have found nothing better, unless noise is all that is left.
     """
     best, floor = min(ends)[0], tracker.objective.floor
-    several = has_several(tracker.objective.model)
-    if attempt + 1 < least and (several or best > floor):
+    if has_several(tracker.objective.model):
+        return best <= MISSING * floor or best > (1.0 - FOUND_AGAIN) * before
+    if attempt + 1 < least and best > floor:
         return False
     if attempt == 0 and best > LOST * floor:
         return False
-    if sum(count for cost, count in ends if cost <= 1.02 * best) > 1:
+    if _agreeing(ends) > 1:
         return True
     return attempt > 0 and best <= floor
 
@@ -427,7 +397,7 @@ def _search_loop(
         own = replace(space, free=tuple(one for one in space.free if one not in NUISANCE))
     try:
         points = [own.encode(space.decode(point)) for point in points]
-        points = [point for _, point in start_points(inner, points, Reading(own, loop), rng)]
+        points = [p for _, p in rank(inner, own, points + Reading(own, loop).starts(rng))]
 
         def step(share: float) -> None:
             progress(DESCENTS + (ON_CURVES - DESCENTS) * share, "loop")
@@ -435,8 +405,16 @@ def _search_loop(
                 tracker.consider(inner.best_values)
                 tracker.look()
 
-        starting = spread_out(own, points, starts)
-        ends = halve(squares(inner, own), own.box, starting, step)
+        points = spread_out(own, points, starts)
+        if series := has_several(own.model) and not own.model.relaxation:
+            stretched = elongations(along, own)
+            points = [
+                levenberg.descend(*stretched, p, own.box, 30, enough=1e-3).point for p in points
+            ]
+        ends = halve(squares(inner, own), own.box, points, step)
+        if series:
+            ends += rank(inner, own, [own.encode(values) for values in tracker.ends])
+            ends = cross(own, ends, squares(inner, own), stretched, rng, MISSING * along.floor)
         ends = [(cost, space.encode(own.decode(end))) for cost, end in ends]
     finally:
         if inner.best_values is not None:

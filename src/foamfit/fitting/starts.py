@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -27,7 +26,6 @@ from foamfit.springs.parameters import family, relaxation_names, split_name
 LOOP_SAMPLES = 300
 CURVE_STARTS = 300
 OWN_MARKS = 5  # random numbers per spring; further ones that a law needs are appended
-LEVELS = (np.arange(7) + 0.5) / 7  # other places of a mark
 # Range of random start values of nuisance parameters, and of the time shift.
 NEAR_USUAL, LATE = (-0.05, 0.05), (-0.3, 0.3)
 AROUND = 200  # random points around the best one
@@ -81,15 +79,6 @@ def thinned(
     )  # fmt: skip
 
 
-class Start(NamedTuple):
-    """A start point read off a loop, and the assumed places, `marks` in [0, 1]."""
-
-    point: Array
-    marks: Array
-    way: int
-    in_series: bool  # whether its springs are read off the kinks of their common loop
-
-
 @dataclass(frozen=True, eq=False)
 class Reading:
     """Reads start points off a measured loop.
@@ -128,7 +117,7 @@ class Reading:
         more = sum(max(law.wanted_marks - OWN_MARKS, 0) for law in laws if law.hysteretic)
         return 7 * len(laws) + more + relaxing
 
-    def start(self, mark: Array, way: int, *, in_series: bool) -> Start:
+    def start(self, mark: Array, way: int, *, in_series: bool) -> Array:
         """Return the start point at some places."""
         space, model, laws = self.space, self.space.model, self.space.model.laws
         values, lines = space.values.copy(), [law.own == ("k0",) for law in laws]
@@ -166,25 +155,16 @@ class Reading:
             for at in range(terms, terms + 2 * model.relaxation * law.hysteretic, 2):
                 values[at] = 10.0 ** (1.5 * next(rest) - 1.5)
                 values[at + 1] = space.scales.duration * 10.0 ** (2.0 * next(rest) - 2.5)
-        return Start(space.encode(values), mark, way, in_series)
+        return space.encode(values)
 
-    def starts(self, rng: np.random.Generator) -> list[Start]:
-        """Return starts at places from a Latin hypercube."""
+    def starts(self, rng: np.random.Generator) -> list[Array]:
+        """Return starts at places from a Latin hypercube, every other one with kinks in series."""
         marks = qmc.LatinHypercube(self.size, rng=rng).random(CURVE_STARTS)
         ways = range(max(law.ways for law in self.space.model.laws))
         return [
             self.start(mark, way, in_series=turn % 2 == 1)
             for (turn, mark), way in product(enumerate(marks), ways)
         ]
-
-    def others(self, one: Start, at: int) -> Iterator[Start]:
-        """Yield the start with one of its marks at other places, if the point changes."""
-        for level in LEVELS:
-            marks = one.marks.copy()
-            marks[at] = level
-            other = self.start(marks, one.way, in_series=one.in_series)
-            if np.any(other.point != one.point):
-                yield other
 
 
 def _anywhere(space: Space, law: Law, marks: Array) -> Array:

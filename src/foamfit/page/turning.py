@@ -148,7 +148,7 @@ class Turning:
         rng = np.random.default_rng(0)
         starts = Reading(space, thinned(problem.measurement, loop=True)).starts(rng)
         tracker = Tracker(problem.objective)
-        rank(tracker, space, [one.point for one in starts])
+        rank(tracker, space, starts)
         return np.asarray(problem.vector() if tracker.best_values is None else tracker.best_values)
 
     def _row(self, name: str) -> Row:
