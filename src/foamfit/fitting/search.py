@@ -352,11 +352,12 @@ def _settled(
     Several descents must agree on the best end, or after a second round its cost must be at the
     noise floor. `least` rounds are made if the best end is above the noise floor, and two if it is
     far above. The ends of springs in series that were combined are no independent ones: there a
-    round with new starts must have found nothing better, unless noise is all that is left.
+    round with new starts must have found nothing better, unless several agree on mere noise.
     """
     best, floor = min(ends)[0], tracker.objective.floor
     if has_several(tracker.objective.model):
-        return best <= MISSING * floor or best > (1.0 - FOUND_AGAIN) * before
+        sure = best <= MISSING * floor and _agreeing(ends) > 1
+        return sure or best > (1.0 - FOUND_AGAIN) * before
     if attempt + 1 < least and best > floor:
         return False
     if attempt == 0 and best > LOST * floor:

@@ -80,13 +80,13 @@ def cross(
     space: Space, ends: Sequence[End], loop: Functions, stretched: Functions,
     rng: np.random.Generator, enough: float,
 ) -> list[End]:  # fmt: skip
-    """Combine the springs of the best ends until nothing better is found; return the best ends.
+    """Combine the springs of the best ends until nothing better is found; return all ends.
 
     A child has a spring of another end, springs that have exchanged branches, or one stiffness far
     off, or is the end itself. It goes on along the `loop`, half of them first along the elongations
     (`stretched`). Nothing better than a cost of `enough` is looked for.
     """
-    pool, failed = [group[0] for group in grouped(ends, DIFFERENT)][:POOL], 0
+    pool, failed, out = [group[0] for group in grouped(ends, DIFFERENT)][:POOL], 0, [*ends]
     while failed < PATIENCE and pool[0][0] > enough:
         best = pool[0][0]
         one, other = (pool[int(len(pool) * rng.random() ** 2)][1] for _ in range(2))
@@ -103,9 +103,10 @@ def cross(
         end = descend(*loop, one, space.box, 12, enough=ALIKE)
         if end.cost < HOPEFUL * best:
             end = descend(*loop, end, space.box, 40, enough=1e-5)
+        out.append((end.cost, end.point))
         failed = 0 if end.cost < (1.0 - ALIKE) * best else failed + 1
-        pool = [group[0] for group in grouped([*pool, (end.cost, end.point)], DIFFERENT)][:POOL]
-    return pool
+        pool = [group[0] for group in grouped([*pool, out[-1]], DIFFERENT)][:POOL]
+    return out
 
 
 def _crossed(space: Space, one: Array, other: Array, rng: np.random.Generator) -> Array:
