@@ -189,14 +189,17 @@ def test_a_microscale_loop_has_its_branches_and_medians() -> None:
     np.testing.assert_allclose(equilibrium.get_ydata(), result.curves.stress / 1e3)
 
 
-def test_the_fraction_snapped_is_drawn_over_time() -> None:
+def test_the_fraction_snapped_is_drawn_over_time_and_in_pictures_of_the_foam() -> None:
     result = fabricated.microscale_result()
     figure = plot_snapping(result)
     assert figure is not None
-    (below,) = figure.axes
+    strip, below = figure.axes
     fraction = result.snapping["s1"].fraction
     np.testing.assert_allclose(line(below, "snapped").get_ydata(), 100 * fraction)
     np.testing.assert_allclose(
         line(below, "ever snapped").get_ydata(), 100 * np.maximum.accumulate(fraction)
     )
+    whole, shaded = strip.patches[6:8]  # the fourth of seven stages, at maximum strain
+    assert whole.get_height() == pytest.approx(0.4, abs=0.004)  # height at 60 % strain
+    assert shaded.get_height() / whole.get_height() == pytest.approx(fraction.max(), 0.01)
     assert plot_snapping(fabricated.result()) is None

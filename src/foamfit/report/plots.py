@@ -1,6 +1,6 @@
 """Figures of a fit, of several loops and of a forward run.
 
-A fit has the three panels of Figs. 3 and 4 of the paper, profiles of the cost, and the fraction of
+A fit has the three panels of Figs. 3 and 4 of the paper, profiles of the cost, and pictures of the
 snapped micro-springs.
 """
 
@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from foamfit.arrays import Array
+from foamfit.data.cycles import cycles_of
 from foamfit.errors import InputError
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, VERMILION
@@ -34,6 +36,8 @@ MOST_NAMED = 12  # loops up to which a legend names all
 HEIGHT, STACKED, STRIP = 133.0, 112.0, 40.0
 BESIDE_IT, BELOW_IT, LEGEND = 51.0, 26.0, 26.0  # room for labels and for the legend
 MOST_WIDE = {0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}  # largest width in inches, by number of panels
+INSTANTS = 7  # pictures of a foam
+SNAPPED, STANDING = "#7FB2D9", "#E6EEF4"  # shades of the snapped part and of the rest of a spring
 LOOP, WIDER = 165.0, 1.45  # prescribed motion: height of the loop, its width over that of others
 Drawn = tuple["Axes", Panel, tuple[float, float]]  # axes, panel, and its size in points
 
@@ -230,15 +234,52 @@ def _profile_lines(profile: Profile, stderr: float | None) -> list[Line]:
 
 
 def plot_snapping(result: Fit) -> Figure | None:
-    """Draw the fraction of snapped micro-springs over time; None if it is not known."""
-    snapping, time, lines = result.snapping, result.curves.time, list[Line]()
-    if not snapping or time is None:
+    """Draw the fraction of snapped micro-springs over time, and the chain at a few instants.
+
+    The instants are evenly spaced along the motion of the first cycle. Return None if no fraction
+    is known.
+    """
+    snapping, time, strain = result.snapping, result.curves.time, result.strain
+    if not snapping or time is None or strain is None:
         return None
-    for (name, one), colour in zip(snapping.items(), (BLUE, VERMILION, *INSIDE), strict=False):
-        of = f" of {name}" if len(result.chain.springs) > 1 else ""
-        style: dict[str, Any] = {"color": colour, "lw": 1.0}
-        lines.append(Line(time, 100.0 * one.fraction, f"snapped{of}", style))
-        lines.append(Line(time, 100.0 * one.ever, f"ever snapped{of}", style | {"ls": "--"}))
-    panel = Panel("snapped-time", ("time", "s"), ("micro-springs", "%"), lines)
-    with panelled([panel], TWO) as (figure, _):
-        return figure
+    first = next(iter(cycles_of(result.measurement).values()), slice(None))
+    along = np.cumsum(np.abs(np.diff(strain[first], prepend=strain[0])))
+    at = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], INSTANTS))).tolist()
+    with figures.drawing(7.0, 3.0) as figure:
+        above, below = figure.subplots(2, 1, height_ratios=[1.0, 1.2])
+        _draw_strip(above, result, strain, at)
+        factor, unit = readable_unit(float(time[-1]), "s")
+        for (name, one), colour in zip(snapping.items(), (BLUE, VERMILION, *INSIDE), strict=False):
+            of = f" of {name}" if len(result.chain.springs) > 1 else ""
+            style = {"color": colour, "lw": 1.0}
+            below.plot(time / factor, 100.0 * one.fraction, label=f"snapped{of}", **style)
+            below.plot(time / factor, 100.0 * one.ever, "--", label=f"ever snapped{of}", **style)
+        for number, sample in enumerate(at, start=1):
+            below.axvline(time[sample] / factor, color=GREY, lw=0.5, ls=":", zorder=0)
+            below.annotate(f"{number}", (time[sample] / factor, 104.0), ha="center", fontsize=7)
+        below.set(xlabel=f"time ({unit})", ylabel="micro-springs (%)", ylim=(0.0, 115.0))
+        figures.legend_below(figure, figures.named_in([below]))
+    return figure
+
+
+def _draw_strip(ax: Axes, result: Fit, overall: Array, at: list[int]) -> None:
+    """Draw the chain at the samples `at`, each spring shaded by its snapped fraction."""
+    chain, snapping = result.chain, result.snapping
+    strains = [overall]
+    if len(chain.springs) > 1:  # all in equilibrium, otherwise no fraction is known
+        stress = next(iter(snapping.values())).stress
+        strains = [np.asarray(spring.strain(stress)) for spring in chain.springs]
+    total = sum(chain.heights)
+    for number, sample in enumerate(at, start=1):
+        floor = 0.0
+        for i, (strain, height) in enumerate(zip(strains, chain.heights, strict=True), start=1):
+            tall = height / total * (1.0 - float(strain[sample]))
+            share = float(snapping[f"s{i}"].fraction[sample]) if f"s{i}" in snapping else 0.0
+            ax.bar(number, tall, 0.5, floor, color=STANDING, edgecolor=GREY, lw=0.6)
+            ax.bar(number, share * tall, 0.5, floor, color=SNAPPED)
+            floor += tall
+        label = f"{number}: {100 * float(overall[sample]):.0f} %"
+        ax.annotate(label, (number, floor), (0, 3), textcoords="offset points", ha="center")
+    ax.set(ylim=(0.0, 1.25), xlim=(0.4, len(at) + 0.6))
+    ax.set_title("shaded: snapped fraction; numbers: strain", loc="left", fontsize=7.5)
+    ax.set_axis_off()
