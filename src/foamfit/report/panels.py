@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from typing import TYPE_CHECKING, Any, Literal
@@ -199,6 +199,9 @@ def size(values: Array) -> float:
 
 # Points at which a spring changes between two branches, in either order.
 POINTS = {"ad": "A1", "da": "A1", "dc": "C1", "ce": "C2", "ec": "C2", "ea": "A2"}
+# Offsets of a name from its point, in typographic points: preferred ones first, then further away.
+SIDES = ((-5.0, 4.0), (5.0, -4.0), (5.0, 4.0), (-5.0, -4.0))
+FARTHER = (1.0, 2.5, 4.0)
 LIGHT = {"a": 0.9, "c": 0.5}  # place of the name along an elastic branch, over its length
 
 
@@ -234,48 +237,46 @@ def _mark_outliers(ax: Axes, panel: Panel, result: Fit) -> None:
 
 
 class _Labels:
-    """Names beside the fitted curve of a panel: on its left, outside of a loop, and kept apart."""
+    """Placement of names in a panel, away from other names, curves and marks."""
 
     def __init__(self, ax: Axes, panel: Panel, size: tuple[float, float]) -> None:
         """Initialise for a panel of about this size in typographic points."""
-        self.ax, (self.fx, _, self.fy, _), self.size = ax, panel.scale(), np.array(size)
-        self.low, high = np.transpose([ax.get_xlim(), ax.get_ylim()])
-        self.scale = self.size / (high - self.low)  # points per unit
-        self.taken: list[tuple[Array, Array]] = []  # centre and half size of names and marks
-        self.curve = np.empty((0, 2))
-        if (on := panel.fitted) is not None:
-            curve = np.column_stack((on.x / self.fx, on.y / self.fy))
-            self.curve = self._placed(curve[evenly(on.x, on.y, 4 * MARKERS)])
-
-    def _placed(self, places: Array) -> Array:
-        return np.asarray((places - self.low) * self.scale)
+        self.ax, (self.fx, _, self.fy, _) = ax, panel.scale()
+        self.corner, high = np.transpose([ax.get_xlim(), ax.get_ylim()])
+        self.size, self.scale = size, np.array(size) / (high - self.corner)  # points per unit
+        self.drawn = [np.empty((0, 2))]  # points that names should not cover
+        for line in panel.lines:
+            if line.kind == "fitted":
+                seen = evenly(line.x, line.y, 4 * MARKERS)
+                self.drawn.append(np.column_stack((line.x / self.fx, line.y / self.fy))[seen])
+        self.taken: list[Array] = []
 
     def mark(self, name: str, places: Array) -> None:
         """Draw dots, which names should not cover, at places (n, 2) in the units of the axes."""
         self.ax.plot(*places.T, "o", ms=3.2, color="black", zorder=5, label=f"_{name}")
-        self.taken += [(at, np.full(2, 1.5)) for at in self._placed(places)]
+        self.drawn += [places, places]
 
-    def write(self, name: str, place: Array, **style: Any) -> None:
-        """Write a name beside a place, or on the other side if it would leave the panel."""
-        at, half, left = self._placed(place), np.array([2.1 * len(name), 4.5]), np.array([0.0, 1.0])
-        if len(self.curve) > 1:
-            near = int(np.argmin(np.hypot(*(self.curve - at).T)))
-            step = self.curve[min(near + 2, len(self.curve) - 1)] - self.curve[max(near - 2, 0)]
-            left = np.array([-step[1], step[0]]) / (np.hypot(*step) or 1.0)
-        sides = product((5.0, 13.0, 21.0, 29.0), (left, -left))
-        offsets = [side * (far + float(np.abs(side) @ half)) for far, side in sides]
-
-        def bad(offset: Array) -> tuple[int, bool]:
-            """Return how many names and marks it covers, and whether it leaves the panel."""
-            centre, middle = at + offset, 0.5 * self.size
-            covered = (np.all(np.abs(centre - c) < half + h) for c, h in self.taken)
-            return sum(map(bool, covered)), bool(np.any(np.abs(centre - middle) > middle - half))
-
-        offset = min(offsets, key=bad)
-        self.taken.append((at + offset, half))
-        style |= {"ha": "center", "va": "center", "zorder": 6, "textcoords": "offset points"}
+    def write(
+        self, name: str, places: Sequence[Array], sides: Sequence[Any] = SIDES, **style: Any
+    ) -> None:
+        """Write a name near one of `places`, where it covers least; earlier ones are preferred."""
+        avoid = (np.concatenate(self.drawn) - self.corner) * self.scale
+        size, candidates = np.array([4.2 * len(name), 9.0]), []
+        for rank, (place, far, (dx, dy)) in enumerate(product(places, FARTHER, sides)):
+            dy, left = far * dy, dx - (size[0] if dx < 0 else 0.0)
+            low = (place - self.corner) * self.scale + (left, dy - 0.5 * size[1])
+            high = low + size
+            names = sum(bool(np.all((low < b[2:]) & (b[:2] < high))) for b in self.taken)
+            beyond = bool(np.any((low < 0.0) | (high > self.size)))
+            inside = int(np.all((avoid > low) & (avoid < high), axis=1).sum())
+            cost = 1000 * names + 100 * beyond + inside + 0.5 * rank
+            candidates.append((cost, place, (dx, dy), np.concatenate((low, high))))
+        _, at, offset, box = min(candidates, key=lambda one: one[0])
+        self.taken.append(box)
+        style |= {"ha": "left" if offset[0] > 0 else "right", "va": "center", "zorder": 6}
         style |= {"bbox": {"fc": "white", "alpha": 0.75, "lw": 0.0, "pad": 0.5}}
-        self.ax.annotate(name, place.tolist(), offset.tolist(), annotation_clip=False, **style)
+        style |= {"textcoords": "offset points", "annotation_clip": False}
+        self.ax.annotate(name, (float(at[0]), float(at[1])), offset, **style)
 
 
 def _mark_switches(labels: _Labels, panel: Panel, result: Fit) -> None:
@@ -287,7 +288,7 @@ def _mark_switches(labels: _Labels, panel: Panel, result: Fit) -> None:
     for name, places in at.items():
         labels.mark(name, np.array(places))
     for name, places in at.items():
-        labels.write(name, np.array(places[0]), fontsize=7)
+        labels.write(name, [np.array(places[0])], fontsize=7)
 
 
 def _points(panel: Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
@@ -327,7 +328,7 @@ def _draw_law(labels: _Labels, result: Fit) -> None:
         if len(line):  # branch c may lie beyond the strains of the test
             ax.plot(*line.T, color="0.72", lw=0.7, zorder=1.5, label=f"_branch {name}")
             at = line[int(LIGHT[name[0]] * (len(line) - 1))]
-            labels.write(name, at, color=GREY, fontsize=7)
+            labels.write(name, [at], color=GREY, fontsize=7)
     if spring.relaxation and "s1" in result.snapping and result.strain is not None:
         style: Any = {"color": "0.35", "lw": 0.7, "ls": (0, (4, 2)), "zorder": 3.5}
         equilibrium = result.as_read(result.snapping["s1"].stress) / labels.fy
@@ -350,10 +351,13 @@ def _name_branches(labels: _Labels, panel: Panel, result: Fit) -> None:
             visits[name] = span, slice(start, end + 1)
     for name, (_, stretch) in visits.items():
         x, y = fitted.x[stretch] / labels.fx, fitted.y[stretch] / labels.fy
-        if x.size:
-            middle = evenly(x, y, 3)[1]
-            at = np.array([x[middle], y[middle]])
-            labels.write(name, at, color=BLUE, fontsize=7.0, label="_on branch")
+        if not x.size:
+            continue
+        middle = x[evenly(x, y, 3)[1]]
+        inner = np.column_stack((x, y))[evenly(x, y, 9)]
+        around = sorted(inner, key=lambda at: float(abs(at[0] - middle)))
+        side = SIDES[1:2] if x[-1] < x[0] else SIDES[:1]  # below the curve on the way back
+        labels.write(name, around, side, color=BLUE, fontsize=7.0, label="_on branch")
 
 
 def _switch_samples(result: Fit, loop: Line) -> list[int]:
