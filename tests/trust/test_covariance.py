@@ -106,8 +106,8 @@ def test_the_half_width_is_that_of_students_t():
 )
 def test_states(half, value, expected):
     assert state("s1_k0", value, about(value, half), 1.0, (0.0, 10.0))[0] == expected
-    side = ((value - 0.1, value + 0.6), "95 % interval")  # far on one side
-    assert state("s1_k0", value, side, 1.0, (0.0, 10.0))[0] == "weak"
+    side = value - 0.1, value + 0.6  # far on one side
+    assert state("s1_k0", value, (side, "95 % interval"), 1.0, (0.0, 10.0))[0] == "weak"
 
 
 def test_the_growth_to_a_further_cycle_is_that_of_predicted_repetitions():

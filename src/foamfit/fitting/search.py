@@ -415,7 +415,7 @@ def _search_loop(
         ends = halve(squares(inner, own), own.box, points, step)
         if series:
             ends += rank(inner, own, [own.encode(values) for values in tracker.ends])
-            ends = cross(own, ends, squares(inner, own), stretched, rng, MISSING * along.floor)
+            ends = cross(own, ends, squares(inner, own), stretched, rng)
         ends = [(cost, space.encode(own.decode(end))) for cost, end in ends]
     finally:
         if inner.best_values is not None:

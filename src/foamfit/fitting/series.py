@@ -78,16 +78,16 @@ def elongations(along: Objective, space: Space) -> Functions:
 
 def cross(
     space: Space, ends: Sequence[End], loop: Functions, stretched: Functions,
-    rng: np.random.Generator, enough: float,
+    rng: np.random.Generator,
 ) -> list[End]:  # fmt: skip
     """Combine the springs of the best ends until nothing better is found; return all ends.
 
     A child has a spring of another end, springs that have exchanged branches, or one stiffness far
     off, or is the end itself. It goes on along the `loop`, half of them first along the elongations
-    (`stretched`). Nothing better than a cost of `enough` is looked for.
+    (`stretched`).
     """
     pool, failed, out = [group[0] for group in grouped(ends, DIFFERENT)][:POOL], 0, [*ends]
-    while failed < PATIENCE and pool[0][0] > enough:
+    while failed < PATIENCE:
         best = pool[0][0]
         one, other = (pool[int(len(pool) * rng.random() ** 2)][1] for _ in range(2))
         way, children = rng.integers(4), [one]

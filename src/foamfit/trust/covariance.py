@@ -322,9 +322,10 @@ def state(
 ) -> tuple[str, str]:
     """Return the state of a varied parameter whose branch was reached, and the reason.
 
-    It is determined if both sides of its interval are within `WEAK` times its scale `size`, not
-    determined if the interval is wider than ±`NOTHING`, otherwise weak. `interval` is the wider of
-    95 % interval and range, not cut at the limits; NaN where the data fix only a combination.
+    It is determined if both sides of its 95 % interval, or half of its range, are within `WEAK`
+    times its scale `size`, not determined if half of either is wider than `NOTHING`, otherwise
+    weak. `interval` is the wider of both, not cut at the limits; NaN where the data fix only a
+    combination.
     """
     ((low, high), what), of = interval, scale_in_words(name, value, size)
     half = 0.5 * (high - low)
@@ -337,7 +338,9 @@ def state(
     for limit in limits:
         if abs(value - limit) <= AT_LIMIT * size:
             return "weak", f"it lies at its limit {limit:g}; its interval is open on that side"
-    width, far = f"its {what} is ±{percent(ratio)} of {of}", max(high - value, value - low)
+    width, far = f"its {what} is ±{percent(ratio)} of {of}", half
+    if what != "range":
+        far = max(high - value, value - low)
     if half <= WEAK * size < far:  # another minimum lies to one side
         width = f"its {what} reaches {percent(far / size)} of {of} to one side"
     return "weak" if far > WEAK * size else "determined", width
