@@ -30,7 +30,7 @@ ALIKE = 1e-3  # relative difference of the costs of descents that ended in one m
 NEARBY, LEAST_SLOPE, LARGEST_SLOPE = 3, 0.02, 20.0
 # Ends that are combined, and the least relative difference of their costs; failures in a row after
 # which this stops; largest cost, over the best one, of a child whose descent goes on.
-POOL, DIFFERENT, PATIENCE, HOPEFUL = 12, 0.01, 60, 1.5
+POOL, DIFFERENT, PATIENCE, HOPEFUL = 12, 0.01, 120, 1.5
 
 
 def grouped(ends: Sequence[End], alike: float) -> list[list[End]]:
