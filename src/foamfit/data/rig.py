@@ -257,24 +257,25 @@ def _completed(stated: dict[str, dict[str, Any]], test: Measurement, relaxing: b
     striker, rate = test.striker or Striker(), loading_rate(test)
     if striker.mass:
         assume(hits, "masses", (striker.mass,), "the mass of the striker")
-    if striker.velocity and "masses" in hits:
-        low, high = (factor * striker.velocity for factor in FASTER)
-        assume(hits, "velocity", (low, high), f"velocities from {low:.3g} to {high:.3g} m/s")
-    if "masses" in hits and "velocity" not in hits:
-        raise InputError('[striker] velocity is missing; give it like "0.5 to 6 m/s".')
-    slow = "masses" not in hits and rate is not None and test.displacement is not None
+    if "masses" in hits:
+        if striker.velocity:
+            low, high = (factor * striker.velocity for factor in FASTER)
+            assume(hits, "velocity", (low, high), f"velocities from {low:.3g} to {high:.3g} m/s")
+        elif "velocity" not in hits:
+            raise InputError('[striker] velocity is missing; give it like "0.5 to 6 m/s".')
+    w, strikes = test.displacement, "masses" in hits
+    slow = not strikes and rate is not None and w is not None
     if machine or slow:
-        w = test.displacement
         most = 0.5 if w is None else float(w.max()) / test.specimen.height
         low, high = FARTHER[0] * most, min(FARTHER[1] * most, 0.9)
         assume(machine, "strain", (low, high), f"strains from {low:.2g} to {high:.2g}")
-        near = rate if rate is not None and "masses" not in hits else 0.1
+        near = 0.1 if rate is None or strikes else rate
         low, high = (factor * near for factor in RATE_RANGE)
         assume(machine, "rate", (low, high), f"strain rates from {low:.3g} to {high:.3g} 1/s")
     if relaxing and slow and test.time is not None:
         lasts = LONG_HOLD * float(test.time[-1] - test.time[0])
         assume(machine, "hold", lasts, f"a hold of {engineering(lasts, 's')}")
-    if "masses" in hits and test.time is not None:
+    if strikes and test.time is not None:
         rate = 1.0 / float(np.median(np.diff(test.time)))
         assume(record, "rate", rate, f"{engineering(rate, 'Hz')} sampling")
     noise, small = record.setdefault("noise", {}), 1e-3 * test.specimen.height
