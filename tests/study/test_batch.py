@@ -20,6 +20,7 @@ import pytest
 import fabricated
 import foamfit as ff
 from conftest import HEIGHT, Inline, run, run_refused, synthetic_impact, write_csv
+from foamfit import files
 from foamfit.cli import fit as command
 from foamfit.report.listing import Row, row_of, write_comparison, write_page
 from foamfit.study import batch as module
@@ -323,6 +324,9 @@ def test_killed_and_called_again_nothing_is_lost_or_done_twice(here, tried, monk
     psutil.wait_procs(others, timeout=20)
     assert not any(map(alive, others))
     done = stamps("out")
+    left = Path(f"out/.c.{files._HOST}.4194303.0123456789abcdef.new")  # of an ended process
+    left.mkdir()
+    (left / "half").touch()
     monkeypatch.setattr(module, "Processes", lambda *_: Inline())
     result = run(*words, "--jobs", "1")
     assert result.exit_code == 2  # bad.csv

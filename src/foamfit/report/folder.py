@@ -233,12 +233,14 @@ def _foreign(folder: Path, batch: bool) -> str:
     """Return the first path in a folder that foamfit did not write, or ""."""
     tests = _content(folder / "joint.json").get("tests")  # folders of a joint fit
     for path in sorted(folder.iterdir()):
+        if batch and is_left(path.name):
+            continue
         if batch and path.is_dir() and not path.is_symlink():
             inside = [one.name for one in path.iterdir()]
             foreign = [name for name in inside if not _is_written(path / name)]
-            if foreign or not any(name in FILES for name in inside):
+            if foreign or (inside and not any(name in FILES for name in inside)):
                 return "/".join([path.name, *foreign[:1]])
-        elif not (batch and is_left(path.name)) and not _is_written(path, tests or ()):
+        elif not _is_written(path, tests or ()):
             return path.name
     return ""
 
