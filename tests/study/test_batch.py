@@ -284,7 +284,7 @@ def test_a_wrong_call_is_one_sentence_and_nothing_is_written(here, monkeypatch, 
     assert sorted(here.rglob("*")) == before
 
 
-@pytest.mark.parametrize("place", ["notes.txt", "a/notes.txt", "mine/notes.txt"])
+@pytest.mark.parametrize("place", ["notes.txt", "a/notes.txt", "mine/notes.txt", "fit.png"])
 def test_a_folder_with_files_of_others_is_refused(here, tried, place):
     again()
     (here / "out" / place).parent.mkdir(exist_ok=True)

@@ -136,6 +136,7 @@ def joint_minima(found: Together) -> list[Together]:
     problems, links, model = found.problems, found.links, found.problems[0].model
     if not has_several(model):
         return [found]
+    whole = Layout.of(problems, links)
     thin = Layout.of(tuple(problem.thinned() for problem in problems), links)
     near, nearly = (max(_near(one.objective) for one in few) for few in (problems, thin.problems))
 
@@ -143,8 +144,7 @@ def joint_minima(found: Together) -> list[Together]:
         end = fit_linked(problems, links, [vectors])
         pairs = zip(problems, end.values, strict=True)
         ordered = [in_order(one.space(), one.objective, values) for one, values in pairs]
-        layout = Layout.of(problems, links)
-        other = layout.fitted(layout.start(ordered))
+        other = whole.fitted(whole.start(ordered))
         return other if other.cost <= end.cost * (1.0 + SAME_COST) else end
 
     ends = [settled(found.values)]

@@ -114,7 +114,8 @@ class SearchRecord:
 
 def _agreeing(ends: Sequence[tuple[float, int]]) -> int:
     """Return the number of descents that led to the best cost, within 2 %."""
-    return sum(count for cost, count in ends if cost <= (1.0 + FOUND_AGAIN) * min(ends)[0])
+    best = min(ends, default=(math.inf, 0))[0]  # none if the fit was stopped early
+    return sum(count for cost, count in ends if cost <= (1.0 + FOUND_AGAIN) * best)
 
 
 @dataclass(eq=False)

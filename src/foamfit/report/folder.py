@@ -167,7 +167,8 @@ def check_target(folder: str | Path, *, of: str | None = None, kept: bool = Fals
                 )
         elif os.path.lexists(place):
             raise InputError(f"{folder} is a file; choose a new or an empty folder")
-        for path in (place, next(path for path in place.parents if path.exists())):
+        above = next(path for path in place.parents if path.exists())  # a kept folder stays in it
+        for path in (place,) if kept and place.is_dir() else (place, above):
             if path.exists() and not path.is_dir():
                 raise NotADirectoryError(0, f"{path} is a file")
             if path.exists() and not os.access(path, os.W_OK | os.X_OK):
@@ -232,15 +233,17 @@ def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
 def _foreign(folder: Path, batch: bool) -> str:
     """Return the first path in a folder that foamfit did not write, or ""."""
     tests = _content(folder / "joint.json").get("tests")  # folders of a joint fit
+    tests = tests if isinstance(tests, dict) else {}
     for path in sorted(folder.iterdir()):
-        if batch and is_left(path.name):
+        of_batch = path.name in FILES["batch.json"] and path.is_file()
+        if batch and (of_batch or is_left(path.name)):
             continue
         if batch and path.is_dir() and not path.is_symlink():
             inside = [one.name for one in path.iterdir()]
             foreign = [name for name in inside if not _is_written(path / name)]
             if foreign or (inside and not any(name in FILES for name in inside)):
                 return "/".join([path.name, *foreign[:1]])
-        elif not _is_written(path, tests or ()):
+        elif batch or not _is_written(path, tests):
             return path.name
     return ""
 

@@ -338,9 +338,8 @@ def state(
     for limit in limits:
         if abs(value - limit) <= AT_LIMIT * size:
             return "weak", f"it lies at its limit {limit:g}; its interval is open on that side"
-    width, far = f"its {what} is ±{percent(ratio)} of {of}", half
-    if what != "range":
-        far = max(high - value, value - low)
+    width = f"its {what} is ±{percent(ratio)} of {of}"
+    far = half if what == "range" else max(high - value, value - low)
     if half <= WEAK * size < far:  # another minimum lies to one side
         width = f"its {what} reaches {percent(far / size)} of {of} to one side"
     return "weak" if far > WEAK * size else "determined", width
