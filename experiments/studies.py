@@ -197,17 +197,6 @@ def gridlines(ax: Any) -> None:
     ax.set_axisbelow(True)
 
 
-def at_shares(strain: Array, stress: Array, up: Array, down: Array, left: float = np.nan) -> Array:
-    """Return a loop's stress at shares of its largest strain: loading `up`, then unloading `down`.
-
-    `left` is the stress below the end of unloading.
-    """
-    turn, share = int(np.argmax(strain)), strain / strain.max()
-    back = np.maximum.accumulate(share[turn:][::-1])
-    loaded = np.interp(up, np.maximum.accumulate(share[: turn + 1]), stress[: turn + 1])
-    return np.concatenate([loaded, np.interp(down, back, stress[turn:][::-1], left=left)])
-
-
 # ------------------------------------------------------------------------------- files of tests
 
 

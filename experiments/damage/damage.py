@@ -1,8 +1,8 @@
-"""What changes from cycle to cycle? Twins of a shoe foam, and printed lattices up to cycle 1000.
+"""What changes from cycle to cycle, and by wear? Shoe foam, and printed lattices to cycle 1000.
 
 Method and answer: README.md. Also written: twins.csv, lattice.csv and lattice.png.
 
-    FOAMFIT_DATA=… python experiments/damage/damage.py
+    FOAMFIT_DATA=… python experiments/damage/damage.py    # --page: from the tables alone
 """
 
 import math
@@ -14,6 +14,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 import foamfit as ff
 from foamfit.text import significant
@@ -26,6 +27,8 @@ HERE = Path(__file__).parent
 MODEL = {"model": "microscale", "relaxation": 1}
 NAMES = tuple(f"s1_{name}" for name in (*studies.MICROSCALE, "g1", "tau1"))
 SHOWN = ("start_strain", "dissipated_energy", "misfit_stress_strain", *NAMES)
+# Compared by wear; a single test cannot separate kc and eps_star.
+WORN = ("dissipated_energy", "peak_stress", *(n for n in NAMES if n[3:] not in ("kc", "eps_star")))
 SHARES = ("start_strain", "misfit_stress_strain")
 LATTICE_CYCLES = (1, 2, 10, 100, 1000)
 
@@ -87,8 +90,25 @@ def twin_changes(table: pd.DataFrame) -> str:
             "of the ten specimens (mean ratio ± standard deviation): "
             f"{'; '.join(parts) or 'nothing'}."
         )
-    lines.append("- Worn against new: see the study of [twins](../twins/README.md).")
     return "\n".join(lines)
+
+
+def worn_table(table: pd.DataFrame, cycle: int) -> str:
+    """Compare worn with new specimens in one cycle: Welch's test of the logarithms, Holm (1979)."""
+    own = table[table["cycle"] == cycle].set_index("specimen")[list(WORN)]
+    logs = [np.log(own[own.index.str.startswith(heel)]) for heel in ("worn", "new")]
+    found = stats.ttest_ind(*logs, equal_var=False)
+    ends = found.confidence_interval()
+    change = np.expm1([logs[0].mean() - logs[1].mean(), ends.low, ends.high]).T
+    order = np.argsort(found.pvalue)
+    left = len(WORN) - np.arange(len(WORN))
+    corrected = np.maximum.accumulate(np.minimum(left * found.pvalue[order], 1.0))
+    rows = []
+    for i, holm in zip(order, corrected, strict=True):
+        text = "{:+.0f} % ({:+.0f} to {:+.0f} %)".format(*(100.0 * change[i])).replace("-", "−")
+        p_values = (significant(p, 2) for p in (found.pvalue[i], holm))
+        rows.append([f"`{WORN[i].removeprefix('s1_')}`", text, *p_values])
+    return studies.markdown(f"cycle {cycle} | worn over new, less one | p | p, corrected", rows)
 
 
 def lattice_table(table: pd.DataFrame) -> str:
@@ -123,8 +143,8 @@ def draw_lattices(found: dict[str, ff.CycleFits]) -> None:
         axes[0].legend(fontsize=6)
 
 
-def main() -> None:
-    studies.arguments(__doc__).parse_args()
+def measure() -> None:
+    """Fit all cycles; write both tables and the figure."""
     studies.measurements("shoe-foam-twins", "lattice-cycles")
     with studies.workplace() as folder:
         lattices, found = fitted(records.LATTICES, folder, cycles=LATTICE_CYCLES)
@@ -132,8 +152,15 @@ def main() -> None:
     studies.write_csv(twins, HERE / "twins.csv", 6)
     studies.write_csv(lattices, HERE / "lattice.csv", 6)
     draw_lattices(found)
+
+
+def main() -> None:
+    if not studies.arguments(__doc__, page=True).parse_args().page:
+        measure()
+    twins, lattices = (pd.read_csv(HERE / f"{name}.csv") for name in ("twins", "lattice"))
+    worn = "\n\n".join(worn_table(twins, cycle) for cycle in (1, 5))
     studies.write_page(
-        HERE, twins=twin_table(twins), told=twin_changes(twins),
+        HERE, twins=twin_table(twins), told=twin_changes(twins), worn=worn,
         lattice=lattice_table(lattices), lattice_told=lattice_changes(lattices),
     )  # fmt: skip
 

@@ -58,9 +58,13 @@ def predicted(
 
 def along(test: ff.Measurement, other: ff.Measurement) -> np.ndarray:
     """Return a test's stress at the relative strains and branches of another test."""
-    at, last = other.displacement / other.displacement.max(), float(test.stress[-1])
-    parts = np.split(at, [int(np.argmax(at)) + 1])
-    return studies.at_shares(test.displacement, test.stress, *parts, last)
+    here, at = (one.displacement / one.displacement.max() for one in (test, other))
+    stress = test.stress
+    turn, there = int(np.argmax(here)), int(np.argmax(at)) + 1
+    back = np.maximum.accumulate(here[turn:][::-1])
+    loaded = np.interp(at[:there], np.maximum.accumulate(here[: turn + 1]), stress[: turn + 1])
+    unloaded = np.interp(at[there:], back, stress[turn:][::-1], left=float(stress[-1]))
+    return np.concatenate([loaded, unloaded])
 
 
 def page(frame: pd.DataFrame) -> None:
