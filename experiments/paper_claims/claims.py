@@ -6,7 +6,7 @@ impact, so the exact response is known.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,16 +45,11 @@ def drive_of_impact(
     name: str = MODEL_2, velocity: float = DRIVE_VELOCITY, samples: int = SAMPLES
 ) -> Drive:
     """Return base stress and motion of an undamped one-spring model hit by a 7 g striker."""
-    item = ff.published[name]
-    chain = ff.Chain(item.chain.springs, item.chain.heights, item.chain.area)
-    hit = ff.Impact(STRIKER, velocity)
-    long = np.linspace(0.0, 20.0 * chain.height / velocity, 101)
-    end = ff.simulate(chain, hit, long, rtol=RTOL).contact_end
-    assert end is not None
-    time = np.linspace(0.0, end, samples)
-    got = ff.simulate(chain, hit, time, rtol=RTOL)
+    chain, spring = impact_scene(name, interior=False), ff.published[name].bistable
+    time = np.linspace(0.0, struck(chain, velocity).contact_end or 0.0, samples)
+    got = ff.simulate(chain, ff.Impact(STRIKER, velocity), time, rtol=RTOL)
     stress = np.maximum(got.base_stress, 0.0)
-    return Drive(item.bistable, chain.height, chain.area, time, stress, got.displacement[-1])
+    return Drive(spring, chain.height, chain.area, time, stress, got.displacement[-1])
 
 
 def driven(drive: Drive, mass: float, damper: float, rtol: float = RTOL) -> ff.Response:
@@ -74,11 +69,11 @@ def displacement_error(drive: Drive, mass: float, damper: float) -> float:
     return rms(got.displacement[-1] - drive.displacement, drive.displacement)
 
 
-def extra_turns(curve: Array, reference: Array, share: float = TURN) -> int:
+def extra_turns(curve: Array, reference: Array) -> int:
     """Count the maxima and minima, larger than a share of the range, that the reference lacks."""
 
     def turns(x: Array) -> int:
-        least = share * float(np.ptp(reference))
+        least = TURN * float(np.ptp(reference))
         return sum(find_peaks(sign * x, prominence=least)[0].size for sign in (1.0, -1.0))
 
     return turns(curve) - turns(reference)
@@ -102,13 +97,12 @@ def oscillation(drive: Drive, mass: float, damper: float) -> dict[str, float]:
     }  # fmt: skip
 
 
-def damper_needed(drive: Drive, mass: float = OWN_MASS, share: float = TURN) -> float:
+def damper_needed(drive: Drive) -> float:
     """Return the least onsite damper (Pa·s) that removes extra turns of stress and motion."""
 
     def calm(log_damper: float) -> bool:
-        got = driven(drive, mass, math.exp(log_damper))
-        pairs = (got.base_stress, drive.stress), (got.displacement[-1], drive.displacement)
-        return not sum(extra_turns(*pair, share) for pair in pairs)
+        got = oscillation(drive, OWN_MASS, math.exp(log_damper))
+        return not (got["turns"] or got["turns_w"])
 
     return math.exp(least(calm, math.log(0.1), math.log(1000.0), math.log(1.01)))
 
@@ -119,14 +113,6 @@ def least(enough: Callable[[float], bool], low: float, high: float, close: float
         middle = 0.5 * (low + high)
         low, high = (low, middle) if enough(middle) else (middle, high)
     return high
-
-
-def vibration_by_branch(drive: Drive) -> dict[str, float]:
-    """Return the largest stress deviation from the drive on each branch, undamped, % of peak."""
-    got = driven(drive, OWN_MASS, 0.0)
-    branches = drive.spring.branches(got.strain)
-    off = 100.0 * abs(got.base_stress - drive.stress) / np.max(drive.stress)
-    return {name: float(np.max(off[branches == name])) for name in "adce"}
 
 
 def free_period(drive: Drive, mass: float, slope: float) -> float:
@@ -177,27 +163,19 @@ def ratio_readings(name: str, eta: float | None = None) -> dict[str, float]:
     }  # fmt: skip
 
 
-def ratio_wanted() -> dict[str, float]:
-    """Return, for single numbers of model-2, the value that would give the paper's ratio, SI."""
+def viscosity_wanted() -> float:
+    """Return the viscosity (Pa·s) that would give the paper's ratio of model-2; ζ ~ η."""
     item = ff.published[MODEL_2]
     by_formula, printed = item.damping_ratio_by_formula(), item.damping_ratio
     assert by_formula is not None
     assert printed is not None
-    factor = printed / by_formula  # ζ ~ η / √(m k_c H / A)
-    return {
-        "eta": ETA * factor,
-        "kc_over_k0": item.bistable.kc / item.bistable.k0 / factor**2,
-        "mass": STRIKER / factor**2,
-        "height": item.chain.height / factor**2,
-        "diameter": math.sqrt(4.0 / math.pi * item.chain.area) * factor,
-    }
+    return ETA * printed / by_formula
 
 
-def impact_scene(name: str, interior: bool = True, **spring: float) -> ff.Chain:
+def impact_scene(name: str, interior: bool = True) -> ff.Chain:
     """Return the chain of a published set without its numerical damper."""
     chain = ff.published[name].chain
-    springs = [replace(s, **spring) for s in chain.springs]
-    return ff.Chain(springs, chain.heights, chain.area, chain.masses if interior else None)
+    return ff.Chain(chain.springs, chain.heights, chain.area, chain.masses if interior else None)
 
 
 def struck(chain: ff.Chain, velocity: float, samples: int = 101) -> ff.Response:
@@ -256,34 +234,17 @@ def rebound(got: ff.Response) -> float:
 def energy_row(name: str, interior: bool = True) -> dict[str, float]:
     """Compare the simulated published impact of one set with its loop; SI."""
     item, chain = ff.published[name], impact_scene(name, interior)
-    velocity = item.striker_velocity
+    velocity, needed = item.striker_velocity, closing_velocity(name, interior)
     got = struck(chain, velocity, 4001)
-    brought = 0.5 * STRIKER * velocity**2 / chain.area
-    needed = closing_velocity(name, interior)
     return {
         "velocity": velocity, "strain": float(np.max(spring_strain(chain, got))),
-        "left": float(spring_strain(chain, got)[np.searchsorted(got.time, got.contact_end)]),
         "c1": item.bistable.eps_hat_c, "peak": float(np.max(got.base_stress)),
         "rebound": rebound(got), "needed": needed,
         "needed_energy": closing_velocity_by_energy(name),
         "excess": 100.0 * ((needed / velocity) ** 2 - 1.0),
-        "brought": brought, "work": work_to_c1(name), "loop": loop_area(name),
     }  # fmt: skip
 
 
 def lost_share(chain: ff.Chain, velocity: float) -> float:
     """Return the share (%) of the striker's energy that is lost."""
     return 100.0 * (1.0 - (rebound(struck(chain, velocity)) / velocity) ** 2)
-
-
-def published_viscosity() -> dict[str, float]:
-    """Return effects of η = 1e4 Pa·s as a real-time dashpot in model-2's published impact; SI."""
-    item = ff.published[MODEL_2]
-    got = struck(impact_scene(MODEL_2, eta=ETA), item.striker_velocity, 2001)
-    return {
-        "stress": ETA * item.striker_velocity / item.chain.height,
-        "first": float(got.base_stress[0]),
-        "strain": float(np.max(got.strain)),
-        "c1": item.bistable.sigma_hat_c,
-        "foam_2": ETA * ff.published[FOAM_2].striker_velocity / ff.published[FOAM_2].chain.height,
-    }

@@ -100,7 +100,7 @@ def test_two_of_three_damping_ratios_follow_from_the_tables() -> None:
     assert not [one for one in each[MODEL_2].values() if f"{one:.3f}" == "0.894"]
     for name, value in formula.items():
         assert ff.published[name].damping_ratio_by_formula() == pytest.approx(value)
-    eta = claims.ratio_wanted()["eta"]
+    eta = claims.viscosity_wanted()
     assert next(iter(claims.ratio_readings(MODEL_2, eta).values())) == pytest.approx(0.894)
 
 
