@@ -1,11 +1,11 @@
 """How many problems do foamfit's search and eight methods of lmfit solve in a few seconds?
 
 Method and answer: README.md. Also written: runs.csv.gz (every improvement by more than 2 %, and
-when a problem was solved), runs.json (machine, settings) and figures. Without FOAMFIT_DATA the shoe
-foam is omitted.
+when a problem was solved), runs.json (machine, settings) and solved.png. Without FOAMFIT_DATA the
+shoe foam is omitted.
 
     FOAMFIT_DATA=… python experiments/identification/identification.py    # 35 min of one core
-    python experiments/identification/identification.py --page            # figures and page only
+    python experiments/identification/identification.py --page            # figure and page only
 """
 
 import argparse
@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import lmfit
+import matplotlib
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
@@ -47,27 +47,10 @@ RECORDED = 0.98  # a cost is recorded below this multiple of the last recorded o
 RUN = ["problem", "coordinates", "method", "seed"]
 OWN = "foamfit.fit"
 SEEDED = ("differential_evolution", "basinhopping", "dual_annealing")
-GROUPS = {
-    "least squares": ("leastsq", "least_squares"),
-    "direct": ("nelder", "powell"),
-    "global": (*SEEDED, "ampgo"),
-}
-METHODS = tuple(name for group in GROUPS.values() for name in group)
+METHODS = ("leastsq", "least_squares", "nelder", "powell", *SEEDED, "ampgo")
 COORDINATES = {
     "si": "lmfit.Parameters in SI, bounds of make_params",
     "box": "lmfit.Parameters in the coordinates of foamfit's search",
-}
-# Colours safe for colour-blind readers (Okabe & Ito, and two more); lines also differ in dashes.
-STYLES = {
-    OWN: (studies.BLUE, "-"),
-    "leastsq": ("black", "-"),
-    "least_squares": (studies.SKY, "--"),
-    "nelder": (studies.GREEN, "-"),
-    "powell": ("#999933", "--"),
-    "differential_evolution": (studies.VERMILION, "-"),
-    "basinhopping": (studies.ORANGE, "--"),
-    "dual_annealing": (studies.PURPLE, "-."),
-    "ampgo": ("#6b6b6b", ":"),
 }
 
 
@@ -274,53 +257,24 @@ def solved_after(runs: pd.DataFrame, known: dict[str, float]) -> pd.DataFrame:
     return after.groupby(RUN, sort=False)["solved_after_s"].min().reset_index()
 
 
-def draw_curves(
-    runs: pd.DataFrame, coordinates: str, known: dict[str, float], budget: float, path: Path
-) -> None:
-    """Plot misfit over the best known against seconds: median and quartiles over the seeds."""
-    elapsed = np.geomspace(0.01, budget, 200)
-    among = runs[runs["coordinates"].isin(("own", coordinates))]
-    with studies.sheet(path, 7.0, 1.7 * len(known) + 0.9) as figure:
-        grid = figure.subplots(len(known), len(GROUPS), sharex=True, sharey=True, squeeze=False)
-        for key, row in zip(known, grid, strict=True):
-            for axes, methods in zip(row, GROUPS.values(), strict=True):
-                for name in (*methods, OWN):
-                    chosen = among[(among["problem"] == key) & (among["method"] == name)]
-                    _band(axes, elapsed, chosen, known[key], name)
-                axes.set(xscale="log", yscale="log")
-                axes.set(xlim=(elapsed[0], elapsed[-1]), ylim=(0.9, 300.0))
-                axes.axhline(1.0, color="0.75", linewidth=0.8, zorder=0)
-                studies.gridlines(axes)
-            row[0].set_ylabel("misfit over\nbest known (–)")
-            row[len(GROUPS) // 2].set_title(CASES[key].title)
-        for axes, title in zip(grid[-1], GROUPS, strict=True):
-            axes.set_xlabel(f"processor time (s): {title}")
-        seeds = runs["seed"].nunique()
-        heading = f"{COORDINATES[coordinates]}: median and quartiles of {seeds} seeds"
-        figure.suptitle(heading, fontsize=8)
-        for name in STYLES:
-            axes.plot([], [], label=name, **_line(name))
-        handles = axes.get_legend_handles_labels()
-        figure.legend(*handles, loc="outside lower center", ncols=5, handlelength=3.2)
-
-
-def _band(axes: Axes, elapsed: Array, runs: pd.DataFrame, known: float, name: str) -> None:
-    """Draw one method: median and quartiles over the seeds at each time."""
-    reached = []
-    for _, run in runs.groupby("seed", sort=False):
-        at = np.searchsorted(run["seconds"].to_numpy(), elapsed, side="right") - 1
-        misfit = np.sqrt(run["cost"].to_numpy() / known)
-        reached.append(np.where(at >= 0, misfit[at], np.inf))
-    low, middle, high = np.quantile(reached, (0.25, 0.5, 0.75), axis=0, method="inverted_cdf")
-    there = list(np.isfinite(high))  # true once three quarters of the seeds have a result
-    line = _line(name)
-    axes.fill_between(elapsed, low, high, where=there, color=line["color"], alpha=0.15, linewidth=0)
-    axes.plot(elapsed, middle, **line)
-
-
-def _line(name: str) -> dict[str, Any]:
-    colour, dash = STYLES[name]
-    return {"color": colour, "linestyle": dash, "linewidth": 2.0 if name == OWN else 1.1}
+def draw(ends: pd.DataFrame, budget: float, path: Path) -> None:
+    """Plot the runs solved against seconds, for the methods in each kind of coordinates."""
+    order = (OWN, *METHODS)
+    with studies.sheet(path, 7.0, 3.4) as figure:
+        axes = figure.subplots(1, len(COORDINATES), sharey=True)
+        for ax, (coordinates, title) in zip(axes, COORDINATES.items(), strict=True):
+            among = ends[ends["coordinates"].isin(("own", coordinates))]
+            for i, name in enumerate(order):
+                own = among.loc[among["method"] == name, "solved_after_s"]
+                after = np.sort(own).clip(max=2.0 * budget)
+                share = np.arange(after.size + 1) / after.size
+                style = {"color": matplotlib.colormaps["tab10"](i), "linewidth": 2.0 - (i > 0)}
+                ax.step([0.01, *after], 100.0 * share, where="post", label=name, **style)
+            ax.set(xscale="log", xlim=(0.01, budget), ylim=(0.0, 101.0), title=title)
+            ax.set_xlabel("processor time (s)")
+            studies.gridlines(ax)
+        axes[0].set_ylabel("runs solved (%)")
+        figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=5)
 
 
 def summary(ends: pd.DataFrame, known: dict[str, float]) -> str:
@@ -340,7 +294,7 @@ def summary(ends: pd.DataFrame, known: dict[str, float]) -> str:
 
 
 def main() -> None:
-    """Run all methods, unless recorded runs are only drawn, and write figures and page."""
+    """Run all methods, unless recorded runs are only drawn, and write figure and page."""
     parser = studies.arguments(__doc__, HERE, page=True, budget=(3.0, "seconds of a run"), seeds=10)
     parser.add_argument("--problems", nargs="+", choices=list(CASES), default=list(CASES))
     options = parser.parse_args()
@@ -353,12 +307,12 @@ def main() -> None:
     runs, setup = pd.read_csv(log), json.loads(notes.read_text())
     lowest = runs.groupby("problem")["cost"].min()
     known = {key: min(cost, float(lowest[key])) for key, cost in setup["known"].items()}
-    for coordinates in COORDINATES:
-        draw_curves(runs, coordinates, known, setup["budget_s"], options.out / f"{coordinates}.png")
+    ends = solved_after(runs, known)
+    draw(ends, setup["budget_s"], options.out / "solved.png")
     studies.write_page(
         HERE, options.out, seeds=runs["seed"].nunique(), problems=len(known),
         budget=setup["budget_s"], machine=setup["machine"],
-        table=summary(solved_after(runs, known), known), **COORDINATES,
+        table=summary(ends, known),
     )  # fmt: skip
 
 
