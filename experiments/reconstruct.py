@@ -22,7 +22,7 @@ from foamfit.springs.published import PublishedSet
 
 HERE = Path(__file__).parent
 NOISE, SEED = 0.01, 2014
-ROWS_BEFORE, ROWS_CONTACT, ROWS_AFTER = 50, 500, 50
+ROWS = 600  # five in six of them in contact
 
 VELOCITIES = {f"foam-1/model-{i}": (1.75, 2.0) for i in (1, 2, 3)} | {"foam-2": (4.44, 4.5)}
 
@@ -52,22 +52,22 @@ displacement = "{displacement:.4g} um"
 """
 
 
-def simulate(item: PublishedSet, velocity: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def simulate(item: PublishedSet, velocity: float, rows: int) -> tuple[np.ndarray, ...]:
     """Return time (s), base stress (Pa) and displacement (m) of an impact with pre-trigger."""
     chain = ff.Chain(item.chain.springs, item.chain.heights, item.chain.area, item.chain.masses)
     drive = ff.Impact(item.striker_mass, velocity)
     end = ff.simulate(chain, drive, np.linspace(0, 20 * chain.height / velocity, 101)).contact_end
     assert end is not None
-    step = end / ROWS_CONTACT
-    time = (np.arange(-ROWS_BEFORE, ROWS_CONTACT + ROWS_AFTER) + 0.5) * step
+    before = rows // 12
+    time = (np.arange(-before, rows - before) + 0.5) * (end / (rows - 2 * before))
     response = ff.simulate(chain, drive, time, rtol=1e-9)
     return time, response.base_stress, response.displacement[-1]
 
 
-def write(item: PublishedSet, velocity: float, place: Path = HERE) -> Path:
+def write(item: PublishedSet, velocity: float, place: Path = HERE, rows: int = ROWS) -> Path:
     """Write the CSV and the TOML of one reconstruction to a subfolder of `place`."""
     rng = np.random.default_rng([SEED, round(1000 * velocity), *item.name.encode()])
-    time, stress, displacement = simulate(item, velocity)
+    time, stress, displacement = simulate(item, velocity, rows)
     noise = (NOISE * np.ptp(stress), NOISE * np.ptp(displacement[stress > 0]))
     force = (stress + noise[0] * rng.standard_normal(time.size)) * item.chain.area
     motion = displacement + noise[1] * rng.standard_normal(time.size)

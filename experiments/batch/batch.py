@@ -1,9 +1,10 @@
-"""What is the overhead of `foamfit batch`? Speed-up, overhead per test, memory.
+"""What is the overhead of `foamfit batch`? Two processes against one, time per test, memory.
 
-Method and answer: README.md, whose numbers are in batch.json.
+Method and answer: README.md, whose numbers are in batch.json. The tests are copies of a
+reconstruction of foam-1.
 
     python experiments/batch/batch.py               # all, some 15 minutes on two idle cores
-    python experiments/batch/batch.py speedup       # one of them; see MEASURES
+    python experiments/batch/batch.py overhead      # one of them; see MEASURES
 """
 
 import contextlib
@@ -12,101 +13,81 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+import pandas as pd
 
-import foamfit as ff
 from foamfit.study import batch as study
-from foamfit.study.batch import Recipe, Task, fingerprint, stored, work
+from foamfit.study.batch import Recipe, Task, fingerprint, work
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
 
 HERE = Path(__file__).parent
+TEST = HERE.parent / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 TESTS, TINY, MANY = 24, 200, 1000
-HEIGHT, AREA = 1.19e-3, 1.9635e-5
-TOML = (
-    '[specimen]\nheight = "1.19 mm"\narea = "19.635 mm^2"\n'
-    '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
-)
-COMMAND = [sys.executable, "-m", "foamfit", "batch"]
 
 
-def make_tests(folder: Path, count: int, samples: int, linear: bool = False) -> None:
-    """Write synthetic tests and their common TOML."""
+def make_tests(folder: Path, count: int, every: int = 1) -> None:
+    """Copy the test, or every n-th row of it (n is `every`), and write the common TOML."""
     folder.mkdir()
-    spring = ff.LinearSpring(8e6) if linear else ff.published["foam-1/model-1"].bistable
-    chain = ff.Chain([spring], [HEIGHT], AREA)
-    t = np.linspace(0.0, 0.75e-3, samples)
-    response = ff.simulate(chain, ff.Impact(7e-3, 2.0), t)
-    curves = response.base_stress, response.displacement[-1]
-    rng = np.random.default_rng(0)
+    table = pd.read_csv(TEST, comment="#")[::every].to_csv(index=False)
     for i in range(count):
-        s, u = (c + 0.01 * np.ptp(c) * rng.standard_normal(samples) for c in curves)
-        columns = {"time": t.round(9), "stress": s.round(), "displacement": u.round(9)}
-        studies.write_test(folder / f"t{i:05d}.csv", **columns)
-    (folder.parent / "foam.toml").write_text(TOML)
+        (folder / f"t{i:05d}.csv").write_text(table)
+    (folder.parent / "foam.toml").write_text(TEST.with_suffix(".toml").read_text())
 
 
-def watched(
-    place: Path, *words: object, note: Callable[[Any], None] = lambda _: None
-) -> dict[str, float]:
-    """Run the command; return wall time, and processor times of the start and of all processes.
+def size_of(folder: Path) -> dict[str, float]:
+    """Return number and size of the files of a result."""
+    sizes = [path.stat().st_size for path in folder.iterdir()]
+    return {"files": len(sizes), "kB": sum(sizes) / 1e3}
 
-    The start is the command itself and the process that forks the others. `note` is called with the
-    process of the command, ten times a second.
+
+def run(place: Path, *words: object) -> tuple[float, float, list[tuple[int, float, float]]]:
+    """Run the command; return its wall and processor time, and its memory ten times a second.
+
+    Each entry of the memory is the number of result folders, and the MiB of the command and of its
+    largest process.
     """
     import psutil
 
-    began, cpu = time.perf_counter(), dict[int, tuple[bool, float]]()
-    command = [*COMMAND, "tests", "--specimen", "foam.toml", "--quiet", *map(str, words)]
-    with subprocess.Popen(command, cwd=place) as process:
+    sizes, began, used = list[tuple[int, float, float]](), time.perf_counter(), os.times()
+    command = [sys.executable, "-m", "foamfit", "batch", "tests", "--specimen", "foam.toml"]
+    with subprocess.Popen([*command, "--quiet", *map(str, words)], cwd=place) as process:
         whole = psutil.Process(process.pid)
         while process.poll() is None:
             time.sleep(0.1)
             with contextlib.suppress(psutil.Error, OSError):
-                first = {whole.pid, *(child.pid for child in whole.children())}
-                for one in (whole, *whole.children(recursive=True)):
-                    times = one.cpu_times()
-                    cpu[one.pid] = one.pid in first, times.user + times.system
-                note(whole)
-    return {
-        "wall_s": time.perf_counter() - began,
-        "start_cpu_s": sum(used for is_first, used in cpu.values() if is_first),
-        "all_cpu_s": sum(used for _, used in cpu.values()),
-    }
+                below = [one.memory_info().rss for one in whole.children(recursive=True)]
+                each = (whole.memory_info().rss, max(below, default=0))
+                sizes.append((len(os.listdir(place / "out")), *(rss / 2**20 for rss in each)))
+    return time.perf_counter() - began, sum(os.times()[2:4]) - sum(used[2:4]), sizes
 
 
-def measure_speedup(place: Path, *words: str) -> dict[str, Any]:
+def measure_speedup(place: Path) -> dict[str, Any]:
     """Compare one process with two, and check that the numbers agree."""
-    make_tests(place / "tests", TESTS, 601)
+    make_tests(place / "tests", TESTS)
     took, values = {}, {}
     for jobs in (1, 2):
         out = place / f"out-{jobs}"
-        took[jobs] = watched(place, "--jobs", jobs, "--out", out.name, *words)
+        took[jobs] = run(place, "--jobs", jobs, "--out", out.name)[0]
         values[jobs] = [file.read_bytes() for file in sorted(out.glob("*/parameters.csv"))]
     return {
         "tests": TESTS, "one": took[1], "two": took[2],
-        "share of ideal (clock)": took[1]["wall_s"] / (2.0 * took[2]["wall_s"]),
+        "share of ideal (clock)": took[1] / (2.0 * took[2]),
         "same numbers": values[1] == values[2] and len(values[1]) == TESTS,
+        **size_of(place / "out-1" / "t00000"),
     }  # fmt: skip
 
 
-def task(path: Path, recipe: Recipe, out: Path) -> Task:
-    """Return a test as the command hands it to a process."""
-    toml = path.parent.with_name("foam.toml")
-    return Task(path.stem, path, toml, recipe, fingerprint(recipe, path, toml), out)
-
-
 def measure_overhead(place: Path) -> dict[str, Any]:
-    """Measure the overhead per test (read, compare, write) and the complete command."""
-    make_tests(place / "tests", TINY, 601)
+    """Measure the overhead per test (read, compare, write), and the size of a result folder."""
+    make_tests(place / "tests", TINY)
     recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=False)
-    fits, real = list[float](), study.fit
+    fits, real, toml = list[float](), study.fit, place / "foam.toml"
 
     def fit(*words: Any, **options: Any) -> Any:
         result, seconds = studies.timed(real, *words, **options)
@@ -114,59 +95,30 @@ def measure_overhead(place: Path) -> dict[str, Any]:
         return result
 
     def whole(path: Path) -> None:
-        work(task(path, recipe, place / "out" / path.stem))
+        key = fingerprint(recipe, path, toml)
+        work(Task(path.stem, path, toml, recipe, key, place / "out" / path.stem))
 
     with patch.object(study, "fit", fit):
         every = [studies.timed(whole, path)[1] for path in sorted((place / "tests").iterdir())]
     mean = [1e3 * float(np.mean(each[20:])) for each in (fits, every)]  # then all is loaded
-    return {"tests": TINY - 20, "fit_ms": mean[0], "beside_ms": mean[1] - mean[0]}
+    found = {"tests": TINY - 20, "fit_ms": mean[0], "beside_ms": mean[1] - mean[0]}
+    return found | size_of(place / "out" / "t00000")
 
 
 def measure_memory(place: Path) -> dict[str, Any]:
     """Measure the resident memory of the processes during a batch of many tests."""
-    make_tests(place / "tests", MANY, 61, linear=True)
+    make_tests(place / "tests", MANY, every=10)
     words = ("--starts", 1, "--model", "linear", "--no-report", "--jobs", 2, "--out", "out")
-    samples: list[tuple[int, float, float]] = []
-
-    def note(whole: Any) -> None:
-        below = [child.memory_info().rss / 2**20 for child in whole.children(recursive=True)]
-        done, own = len(os.listdir(place / "out")), whole.memory_info().rss / 2**20
-        samples.append((done, own, max(below, default=0.0)))
-
-    watched(place, *words, note=note)
-    at = {}
+    sizes, at = run(place, *words)[2], {}
     for wanted in (100, 500, MANY - 20):
-        done, main, worker = min(samples, key=lambda s, w=wanted: abs(s[0] - w))
+        done, main, worker = min(sizes, key=lambda s, w=wanted: abs(s[0] - w))
         at[str(wanted)] = {"done": done, "command_MiB": main, "largest_process_MiB": worker}
-    again = watched(place, *words)
-    return {"tests": MANY, "after": at, "called again, nothing to do": again}
-
-
-def measure_parts(place: Path) -> dict[str, Any]:
-    """Measure the work of the coordinating process per test (ms) and the disk usage."""
-    make_tests(place / "tests", 50, 601)
-    paths, found = sorted((place / "tests").iterdir()), {}
-    for name, pages in {"no report": False, "reports": True}.items():
-        recipe = Recipe("bistable", {"starts": 1, "intervals": "local"}, pages=pages)
-        first = task(paths[0], recipe, place / name)
-        work(first)
-        files = [path.stat().st_size for path in first.out.iterdir()]
-        began = time.process_time()
-        for path in paths:
-            fingerprint(recipe, path, first.toml)
-            stored(first)
-        again = 1e3 * (time.process_time() - began) / len(paths)
-        found[name] = {"files": len(files), "kB": sum(files) / 1e3, "again_ms": again}
-    return found
+    return {"tests": MANY, "after": at, "again_cpu_s": run(place, *words)[1]}
 
 
 MEASURES = {
-    "speedup": lambda place: measure_speedup(place, "--no-report"),
-    "speedup-reports": measure_speedup,
-    "overhead": measure_overhead,
-    "memory": measure_memory,
-    "parts": measure_parts,
-}
+    "speedup": measure_speedup, "overhead": measure_overhead, "memory": measure_memory,
+}  # fmt: skip
 
 
 def main() -> None:

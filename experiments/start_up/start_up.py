@@ -17,16 +17,13 @@ import time
 from collections import defaultdict
 from pathlib import Path
 
-import numpy as np
-
 import foamfit as ff
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import reconstruct
 import studies
 
 HERE = Path(__file__).parent
-TOML = '[specimen]\nheight = "1.19 mm"\ndiameter = "5 mm"\n'
-TOML += '[striker]\nmass = "7 g"\nvelocity = "2 m/s"\n'
 PARTS = {  # of a fit, and what each runs
     "start of Python, command line": "import foamfit.cli",
     "CSV and TOML read (pandas, pint, parts of SciPy)":
@@ -41,20 +38,6 @@ PROBE = (  # garbage is collected as in the command
     + MARK.join([*PARTS.values(), ""])
     + "print(*(after - before for before, after in zip(marks, marks[1:])))\ngc.freeze()"
 )
-
-
-def write(folder: Path, rows: int) -> Path:
-    """Write the synthetic test."""
-    item = ff.published["foam-1/model-1"]
-    chain = ff.Chain(item.chain.springs, item.chain.heights, item.chain.area)
-    t = np.linspace(-0.1e-3, 0.8e-3, rows)
-    response = ff.simulate(chain, ff.Impact(7e-3, 2.0), t)
-    rng = np.random.default_rng(0)
-    stress = response.base_stress + 1.0 / chain.area * rng.standard_normal(rows)
-    motion = response.displacement[-1] + 4e-6 * rng.standard_normal(rows)
-    path = folder / "synthetic.csv"
-    columns = {"stress": stress.round(), "displacement": motion.round(9)}
-    return studies.write_test(path, TOML, time=(t - t[0]).round(10), **columns)
 
 
 def run(command: list[str], **variables: str) -> tuple[float, float, str]:
@@ -90,17 +73,22 @@ def measure(test: Path, first: int, warm: int) -> dict[str, float]:
 
 def main() -> None:
     parser = studies.arguments(
-        __doc__, HERE, rows=600, first=(3, "fits at first use"), warm=(9, "fits once compiled")
+        __doc__,
+        HERE,
+        rows=reconstruct.ROWS,
+        first=(3, "fits at first use"),
+        warm=(9, "fits once compiled"),
     )
     options = parser.parse_args()
     with studies.workplace() as folder:
-        measured = measure(write(folder, options.rows), options.first, options.warm)
+        test = reconstruct.write(ff.published["foam-1/model-1"], 2.0, folder, options.rows)
+        measured = measure(test, options.first, options.warm)
     rows = ((name, f"{seconds:.2f}") for name, seconds in measured.items())
     table = studies.markdown([f"{options.rows} rows", "wall time (s)"], rows)
     print(table)
     peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     print(f"peak memory {peak:.0f} MiB")
-    if options.rows == 600:
+    if options.rows == reconstruct.ROWS:
         machine = f"{os.cpu_count()} cores, {studies.circumstances()}"
         studies.write_page(HERE, options.out, table=table, circumstances=machine)
 
