@@ -1,13 +1,12 @@
 """Do springs that remember describe all cycles of a foam with one set of parameters?
 
 Method and answer: README.md. Also written: memory.csv (a row for each cycle of each specimen),
-parameters.csv (every parameter of every fit), ways_back.csv and memory.png.
+parameters.csv (every parameter of every fit) and memory.png.
 
     FOAMFIT_DATA=… python experiments/memory/memory.py          # --page: from the tables alone
 """
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,7 @@ import numpy as np
 import pandas as pd
 
 import foamfit as ff
-from foamfit.data.cycles import cycles_of, find_turns
-from foamfit.data.noise import noise_level
+from foamfit.data.cycles import cycles_of
 from foamfit.results import Fit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -26,18 +24,12 @@ from real_foams import varied
 from records import HEELS, SOURCE
 
 HERE = Path(__file__).parent
-TABLE, PARAMETERS, BACK = (HERE / f"{name}.csv" for name in ("memory", "parameters", "ways_back"))
+TABLE, PARAMETERS = HERE / "memory.csv", HERE / "parameters.csv"
 SHOWN = "new-heel-comp-3"  # in the picture
 FIRST, HISTORY, PREDICTED = "first cycle", "cycles 1 to 3", "predicted"
 # Specimens on which the growth of the band was chosen.
 CHOSEN = [f"new-heel-comp-{i}" for i in (1, 2, 4, 5)]
 BARS = {FIRST: (0.56, 0.75), HISTORY: (0.90, 1.10), PREDICTED: (1.0, 1.25)}  # mean, worst, %
-# Columns of motion and force in the files that are searched for partial unloading.
-MOTIONS = ("Gap (um)", "Position(Linear:Position) (mm)", "displacement_m", "Strain",
-           "engineering_strain")  # fmt: skip
-FORCES = ("Normal force (N)", "Force(Linear:Load) (kN)", "force_N", "specific_force_N_per_kg",
-          "Stress (MPa)", "engineering_stress_MPa")  # fmt: skip
-LOADED, WHOLE = 0.05, 0.35  # minimum shares of the largest force and of the motion
 MEMORY: dict[str, Any] = {"model": "microscale", "stiffening": True, "mullins": True}
 
 
@@ -51,29 +43,6 @@ def misfits(test: ff.Measurement, result: Fit) -> dict[int, float]:
         number: float(np.sqrt(np.mean((fitted - measured)[part] ** 2)) / np.ptp(measured[part]))
         for number, part in spans.items()
     }
-
-
-def turned_back(data: Path) -> Iterator[dict[str, Any]]:
-    """Find the largest reversal of each motion under load, during loading and unloading.
-
-    Loading or unloading ends where at least `WHOLE` of the motion is reversed; a smaller reversal
-    is an inner loop.
-    """
-    for file in sorted(data.glob("*/*.*")):
-        if file.stem in ("specimens", "test_1_raw"):  # specimen table; raw form of test_1_impact
-            continue
-        table = pd.read_csv(file, sep="\t" if file.suffix == ".txt" else ",", index_col=False)
-        columns = (next(c for c in names if c in table) for names in (MOTIONS, FORCES))
-        w, force = (table[column].to_numpy(float) for column in columns)
-        force = force * np.sign(force[np.argmax(np.abs(force))])  # compression is positive
-        w = w * np.sign(np.corrcoef(w, force)[0, 1]) / np.ptp(w)
-        ends = [0, *find_turns(w, WHOLE).tolist(), w.size]
-        back = 0.0
-        for i, part in enumerate(map(slice, ends, ends[1:])):
-            way = w[part][force[part] > LOADED * force.max()] * (-1) ** i
-            back = max(back, float(np.max(np.maximum.accumulate(way) - way, initial=0.0)))
-        yield {"folder": file.parent.name, "record": file.stem, "ways": len(ends) - 1,
-               "back": back, "noise": noise_level(w)}  # fmt: skip
 
 
 def study() -> None:
@@ -186,21 +155,15 @@ def values_table(values: pd.DataFrame) -> str:
 
 def main() -> None:
     if not studies.arguments(__doc__, page=True).parse_args().page:
-        data = studies.measurements("shoe-foam", "shoe-foam-twins")
-        studies.write_csv(turned_back(data), BACK)
+        studies.measurements("shoe-foam", "shoe-foam-twins")
         study()
-    table, values, back = (pd.read_csv(one) for one in (TABLE, PARAMETERS, BACK))
-    back = back.groupby("folder").agg({"record": "count", "ways": "sum", "back": "max"})
-    back["back"] = back["back"].map(lambda share: f"{100.0 * share:.1g} %")
+    table, values = pd.read_csv(TABLE), pd.read_csv(PARAMETERS)
     took = table[table["what"] == HISTORY]["seconds"].dropna()
     studies.write_page(
         HERE, source=SOURCE, summary=summary(table), specimens=per_specimen(table),
         values=values_table(values), inside=coverage(table[table["what"] == PREDICTED]),
         seconds=f"{took.min():.0f} to {took.max():.0f} s, {took.mean():.0f} s on average,",
         verified=coverage(table[(table["what"] == PREDICTED) & ~table["test"].isin(CHOSEN)]),
-        back=studies.markdown(
-            "folder | records | loadings, unloadings | most taken back", back.itertuples()
-        ),
     )  # fmt: skip
 
 
