@@ -85,7 +85,7 @@ def test_a_joint_fit_exchanges_branches_between_springs(tmp_path):
     problems, vectors = [], []
     for seed, speed in enumerate((4.0, 5.3)):
         course = truth.Rig((soft, stiff), (6e-4, 6e-4), AREA, 7e-3, speed).run(0.0, 0.03)
-        made = rig.recorded(rig.Impact(samples=300), course, seed)
+        made = rig.recorded(rig.Impact(samples=150), course, seed)
         test = ff.read_test(rig.write(made, tmp_path, f"{seed}"))
         problems.append(make_problem(test, "bistable+bistable", "impact", None, None, False))
         values = made.truth | {"s1_kc": stiff.kc, "s2_kc": soft.kc}
