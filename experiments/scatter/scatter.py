@@ -2,10 +2,11 @@
 
 Method and answer: README.md. Also written: scatter.csv.
 
-    FOAMFIT_DATA=… python experiments/scatter/scatter.py       # ten minutes
+    FOAMFIT_DATA=… python experiments/scatter/scatter.py    # ten minutes; --page: from the table
 """
 
 import sys
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,37 +24,31 @@ import studies
 HERE = Path(__file__).parent
 GROUPS, COUNT = ("new", "worn"), 5
 SCATTER = dict.fromkeys((*studies.MICROSCALE, "g1", "tau1"), "scatter")
-OPEN = {"k0": "scatter", "sigma_plus": "shared"}  # the others are own
 
 
-def predicted(
-    folder: Path, group: str, fitted: list[int], left: list[int], kinds: dict[str, str]
-) -> list[dict[str, Any]]:
-    """Fit some specimens jointly and predict others; return one row for each."""
-    names = {i: f"{group}-heel-comp-{i}_raw.txt" for i in (*fitted, *left)}
+def predicted(folder: Path, group: str, left: int) -> dict[str, Any]:
+    """Predict one specimen from a joint fit of the others of its group."""
+    names = {i: f"{group}-heel-comp-{i}_raw.txt" for i in range(1, COUNT + 1)}
     study = studies.write_study(
-        folder / "study.toml", [names[i] for i in fitted], "microscale", kinds,
-        relaxation=1, drive="displacement", name=f"{group} heel",
+        folder / "study.toml", [name for i, name in names.items() if i != left], "microscale",
+        SCATTER, relaxation=1, drive="displacement", name=f"{group} heel",
     )  # fmt: skip
-    result, rows = ff.joint(study), []
     every = {i: ff.read_test(folder / name) for i, name in names.items()}
-    for i in left:
-        found = ff.predict(result, every[i])
-        one = found.curves["stress_strain"]
-        simple = np.array([along(every[j], every[i]) for j in fitted])
-        t = float(stats.t.ppf(0.975, len(fitted) - 1))
-        half = t * simple.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / len(fitted))
-        off = np.abs(every[i].stress - simple.mean(axis=0))
-        rows.append({
-            "specimen": f"{group} {i}", "fitted": len(fitted), "samples": int(one.kept.sum()),
-            "inside": one.inside, "half_width": one.half_width / one.range,
-            "inside_simple": float(np.mean(off <= half)),
-            "half_width_simple": float(half.mean()) / one.range,
-            **{part: one.half_width_of(part) / one.range for part in one.parts},
-            "warned": any("leave open" in w for w in found.warnings),
-        })  # fmt: skip
-        print(rows[-1], flush=True)
-    return rows
+    test = every.pop(left)
+    found = ff.predict(ff.joint(study), test)
+    one = found.curves["stress_strain"]
+    simple = np.array([along(other, test) for other in every.values()])
+    t = float(stats.t.ppf(0.975, COUNT - 2))
+    half = t * simple.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / (COUNT - 1))
+    off = np.abs(test.stress - simple.mean(axis=0))
+    return {
+        "specimen": f"{group} {left}", "samples": int(one.kept.sum()),
+        "inside": one.inside, "half_width": one.half_width / one.range,
+        "inside_simple": float(np.mean(off <= half)),
+        "half_width_simple": float(half.mean()) / one.range,
+        **{part: one.half_width_of(part) / one.range for part in one.parts},
+        "warned": any("leave open" in w for w in found.warnings),
+    }  # fmt: skip
 
 
 def along(test: ff.Measurement, other: ff.Measurement) -> np.ndarray:
@@ -69,40 +64,32 @@ def along(test: ff.Measurement, other: ff.Measurement) -> np.ndarray:
 
 def page(frame: pd.DataFrame) -> None:
     """Write the page from all rows."""
-    four, two = frame[frame.fitted == COUNT - 1], frame[frame.fitted == 2]
-    ratio = four.half_width / four.half_width_simple
-    t_alone = np.sqrt(1.0 + 1.0 / (COUNT - 1))
-    rows = [
+    ratio, t_alone = frame.half_width / frame.half_width_simple, np.sqrt(1.0 + 1.0 / (COUNT - 1))
+    rows = (
         [r.specimen, percent(r.inside, 3), f"±{percent(r.half_width)}", percent(r.inside_simple, 3),
          f"±{percent(r.half_width_simple)}", f"{r.half_width / r.half_width_simple:.2f}",
          f"{r.half_width / r.half_width_simple * t_alone:.2f}"]
-        for r in (*four.itertuples(), *two.itertuples())
-    ]  # fmt: skip
-    good = four[four.inside >= 0.93]
-    inside, simple = (np.average(one, weights=four.samples) for one in
-                      (four.inside, four.inside_simple))  # fmt: skip
+        for r in frame.itertuples()
+    )  # fmt: skip
+    good = frame[frame.inside >= 0.93]
+    inside, simple = (np.average(frame[one], weights=frame.samples)
+                      for one in ("inside", "inside_simple"))  # fmt: skip
     studies.write_page(
-        HERE, rows=studies.lines(rows[: len(four)]),
-        two=studies.lines(row[:3] for row in rows[len(four) :]),
+        HERE, rows=studies.lines(rows),
         inside=percent(float(inside), 3), simple=percent(float(simple), 3),
         median=ratio.median(), least=ratio.min(), most=ratio.max(),
-        few=len(four) - len(good), count=len(four), rest=percent(good.inside.min(), 3),
+        few=len(frame) - len(good), count=len(frame), rest=percent(good.inside.min(), 3),
     )  # fmt: skip
 
 
 def main() -> None:
-    studies.arguments(__doc__).parse_args()
-    studies.measurements("shoe-foam-twins")
-    rows, numbers = [], list(range(1, COUNT + 1))
-    with records.placed(*records.HEELS) as folder:
-        for group in GROUPS:
-            for left in numbers:
-                others = [i for i in numbers if i != left]
-                rows += predicted(folder, group, others, [left], SCATTER)
-            rows += predicted(folder, group, [1, 2], [3, 4, 5], OPEN)
-    frame = pd.DataFrame(rows)
-    studies.write_csv(frame, HERE / "scatter.csv", 5)
-    page(frame)
+    if not studies.arguments(__doc__, page=True).parse_args().page:
+        studies.measurements("shoe-foam-twins")
+        with records.placed(*records.HEELS) as folder:
+            cases = product(GROUPS, range(1, COUNT + 1))
+            frame = studies.said(predicted(folder, group, left) for group, left in cases)
+        studies.write_csv(frame, HERE / "scatter.csv", 5)
+    page(pd.read_csv(HERE / "scatter.csv"))
 
 
 if __name__ == "__main__":
