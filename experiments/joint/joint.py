@@ -19,6 +19,7 @@ import foamfit as ff
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
+from truth import Microscale, Motion, Rig
 
 HERE = Path(__file__).parent
 HEIGHT, TOP, NOISE, SAMPLES = 10e-3, 0.5, 400.0, 101
@@ -34,14 +35,11 @@ Row = dict[str, Any]
 
 def write_test(path: Path, rate: float, rng: np.random.Generator, **own: float) -> None:
     """Write a test of the foam with some changed parameters."""
-    spring = ff.MicroscaleSpring(**SPRING | own)
-    up = np.linspace(0.0, TOP, SAMPLES // 2 + 1)
-    strain = np.append(up, up[-2::-1])
-    clock = np.arange(strain.size) * (up[1] / rate)
-    drive = ff.DisplacementDrive(HEIGHT * strain)
-    stress = ff.simulate(ff.Chain([spring], [HEIGHT], 1e-4), drive, clock).base_stress
-    stress = stress + NOISE * rng.standard_normal(stress.size)
-    studies.write_test(path, time=clock, stress=stress, displacement=HEIGHT * strain)
+    clock = np.linspace(0.0, 2.0 * TOP / rate, SAMPLES)
+    motion = Motion(tuple(clock[[0, SAMPLES // 2, -1]]), (0.0, HEIGHT * TOP, 0.0), ("line",) * 2)
+    foam = Rig((Microscale(**SPRING | own),), (HEIGHT,), 1e-4, motion=motion)
+    stress = foam.follow(clock).base_stress + NOISE * rng.standard_normal(SAMPLES)
+    studies.write_test(path, time=clock, stress=stress, displacement=motion.at(clock))
 
 
 def write_study(folder: Path, kinds: dict[str, str]) -> Path:

@@ -15,6 +15,7 @@ import pandas as pd
 
 import foamfit as ff
 from foamfit.data.cycles import cycles_of
+from foamfit.report.studies.prediction import plot_prediction
 from foamfit.results import Fit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -78,33 +79,7 @@ def study() -> None:
             cycles = [{"cycle": n, **one} for n, one in later.by_cycle.items() if n > 3]
             add(specimen, PREDICTED, cycles, result)
             if specimen == SHOWN:
-                draw(later, HERE / "memory.png")
-
-
-def draw(later: ff.Prediction, path: Path) -> None:
-    """Draw measured, fitted and predicted cycles of one specimen."""
-    curve, test = next(iter(later.curves.values())), later.measurement
-    assert test.displacement is not None
-    strain, spans = test.displacement / test.specimen.height, cycles_of(test)
-    with studies.sheet(path, 7.0, 3.3, 250) as figure:
-        axes = figure.subplots(1, 2, sharey=True)
-        for ax, fits, title in zip(axes, (True, False), ("fitted", "predicted"), strict=True):
-            for number, part in spans.items():
-                if (number <= 3) != fits:
-                    continue
-                x = strain[part]
-                (line,) = ax.plot(x, curve.predicted[part] / 1e3, lw=1.1, label=f"cycle {number}")
-                ax.plot(x[::6], curve.measured[part][::6] / 1e3, "o", ms=2.4, mfc="none",
-                        mec=line.get_color(), mew=0.5)  # fmt: skip
-                if not fits:
-                    ends = curve.lo[part] / 1e3, curve.hi[part] / 1e3
-                    ax.fill_between(x, *ends, color=line.get_color(), alpha=0.15, lw=0)
-            ax.plot([], [], "o", ms=2.4, mfc="none", mec=studies.GREY, mew=0.5, label="measured")
-            ax.set(title=title, xlabel="strain (–)")
-            ax.legend(loc="upper left")
-        axes[0].set_ylabel("stress (kPa)")
-        title = f"{SHOWN}, one set of parameters; measured: {SOURCE}"
-        figure.suptitle(title, x=0.012, ha="left", fontsize=8.0)
+                plot_prediction(later).savefig(HERE / "memory.png", dpi=200)
 
 
 def summary(table: pd.DataFrame) -> str:
