@@ -1,16 +1,18 @@
-"""An independent law of the bistable and the linear spring.
+"""Independent laws of the springs, and derivatives by differences.
 
 Nothing here uses the package: of springs only the parameters are read. Derived points are those of
 the judge of the stability study, which finds them by bracketing.
 """
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
+from scipy.special import ndtr
 
 from independent import HAT_A, HAT_C, SIG_A, SIG_C, STAR, bistable_row
 
@@ -153,6 +155,77 @@ class BistableLaw:
         return sum(self.integral(*piece) for piece in corners)
 
 
+# ------------------------------------------------------------------------------ microscale springs
+
+
+class Microscale:
+    """Section 8 of docs/theory.md, with ranks w and W in place of p and P: 1 - P is accurate.
+
+    The state is updated in small steps, the strain is explicit, and the stress at a strain is found
+    by bracketing.
+    """
+
+    def __init__(self, spring: Any) -> None:
+        self.spring, self.s, self.w, self.most = spring, 0.0, -math.inf, -math.inf
+
+    def moved(self, s: float) -> tuple[float, float]:
+        p, first, back = self.spring, -math.inf, -math.inf
+        if s > 0.0:
+            first = math.log(s / p.sigma_plus) / p.spread_plus
+            back = math.log(s / p.sigma_minus) / p.spread_minus
+        least = max(first, min(first + p.weakening / p.spread_plus, self.most))
+        w = min(max(self.w, least), max(least, back))
+        return w, max(self.most, w)
+
+    def on_a(self, s: float, k: float) -> float:
+        n = self.spring.stiffening
+        return -math.expm1(-math.log1p(n * s / k) / n) if n * s > -k else -math.inf
+
+    def strain(self, s: float) -> float:
+        p, (w, most) = self.spring, self.moved(s)
+        never, once, snapped = ndtr(-most), ndtr(-w) - ndtr(-most), ndtr(w)
+        strain = never * self.on_a(s, p.k0)
+        if once > 0.0:
+            strain += once * self.on_a(s, p.k0 * math.exp(-p.softening))
+        return strain + snapped * (p.eps_star + s / (p.kc + s)) if snapped > 0.0 else strain
+
+    def stress(self, strain: float) -> float:
+        low, high = 0.0, self.spring.k0
+        if self.strain(0.0) > strain:  # in tension
+            low, high = -1e-9 * high, 0.0
+            while self.strain(low) > strain:
+                low *= 2.0
+        else:
+            while self.strain(high) < strain:
+                high *= 2.0
+            near = high
+            while near > 1e-280 and self.strain(near) > strain:  # bracket small roots closely
+                near *= 1e-3
+            low = near if self.strain(near) <= strain else 0.0
+        if self.strain(low) == strain:
+            return low
+        return float(
+            brentq(
+                lambda s: max(self.strain(s) - strain, -1e300), low, high,
+                xtol=1e-300, rtol=9e-16, maxiter=1000,
+            )
+        )  # fmt: skip
+
+    def keep(self, s: float) -> None:
+        for part in np.linspace(self.s, s, 5)[1:]:
+            self.w, self.most = self.moved(float(part))
+        self.s = s
+
+    @classmethod
+    def along(cls, spring: Any, given: ArrayLike, what: str) -> Array:
+        """Return the "stress" at each strain of a history, or the "strain" at each stress."""
+        one, out = cls(spring), []
+        for value in np.asarray(given, float):
+            out.append(getattr(one, what)(value))
+            one.keep(out[-1] if what == "stress" else value)
+        return np.array(out)
+
+
 @cache
 def _law(spring: Any) -> BistableLaw | LinearLaw:
     return BistableLaw(spring) if hasattr(spring, "kc") else LinearLaw(spring)
@@ -161,3 +234,23 @@ def _law(spring: Any) -> BistableLaw | LinearLaw:
 def law(spring: Any) -> Any:
     """Return the law of any object that has the attributes of a spring."""
     return _law(spring)
+
+
+# ----------------------------------------------------------------------------------- derivatives
+
+
+def differences(run: Callable[[float], Any], step: float, order: int = 4) -> tuple[Array, Array]:
+    """Return derivatives of displacement and base stress by central differences of order 2 or 4.
+
+    `run` takes the change of a value.
+    """
+    weights = {2: (1 / 2,), 4: (2 / 3, -1 / 12)}[order]
+    sides = [(run(k * step), run(-k * step)) for k in range(1, len(weights) + 1)]
+    moved, stress = (
+        sum(
+            weight * (getattr(up, what) - getattr(down, what)) / step
+            for weight, (up, down) in zip(weights, sides, strict=True)
+        )
+        for what in ("displacement", "base_stress")
+    )
+    return moved, stress

@@ -65,10 +65,6 @@ def haversine(turn: float) -> Motion:
     return smooth(lambda t: 0.5 - 0.5 * np.cos(np.pi * t / turn))
 
 
-def trapezoid(start: float, hold: float) -> Motion:
-    return straight([0.0, start, start + hold, 1.0], [0.0, 1.0, 1.0, 0.0])
-
-
 def slow_start(ramp: float, turn: float) -> Motion:
     """Return a triangle whose speed grows from zero along the ramp."""
 
@@ -115,7 +111,9 @@ CLASSES: dict[str, Callable[[np.random.Generator], Motion]] = {
         [0.0, rng.choice([rng.uniform(0.08, 0.4), rng.uniform(0.6, 0.92)]), 1.0], [0.0, 1.0, 0.0]),
     "half sine": lambda rng: half_sine(rng.uniform(0.8, 1.0)),
     "haversine": lambda rng: haversine(rng.uniform(0.45, 0.55)),
-    "trapezoid": lambda rng: trapezoid(rng.uniform(0.35, 0.45), rng.uniform(0.02, 0.2)),
+    "trapezoid": lambda rng: straight(
+        [0.0, start := rng.uniform(0.35, 0.45), start + rng.uniform(0.02, 0.2), 1.0],
+        [0.0, 1.0, 1.0, 0.0]),
     "slow start": lambda rng: slow_start(rng.uniform(0.01, 0.1), rng.uniform(0.4, 0.6)),
     "inner loop": inner_loop, "random smooth": random_smooth,
 }  # fmt: skip

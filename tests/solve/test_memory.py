@@ -1,6 +1,7 @@
 """Chains of springs with memory: the explicit integrator against an independent one."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from foamfit.springs.chain import Drive
 from foamfit.springs.parameters import direction
 from foamfit.springs.spring import Spring
 from independent import Array, follow, over_range
+from reference import differences
 
 AREA = 1.9635e-5
 TIME = np.linspace(0.0, 3e-3, 61)
@@ -156,6 +158,12 @@ def with_value(given: ff.Chain, name: str, value: float) -> ff.Chain:
     return ff.Chain(springs, heights, given.area, given.masses, site)
 
 
+def changed(given: ff.Chain, drive: Drive, name: str, by: float) -> ff.Response:
+    """Simulate with one value changed."""
+    other = with_value(given, name, value_of(given, name) + by)
+    return ff.simulate(other, drive, TIME, 1e-10)
+
+
 # Rounding makes springs reverse repeatedly here, which stops the judge.
 TURNING = ("motion of two", "impact, gap between masses", "stress, viscous top")
 
@@ -217,14 +225,9 @@ def test_derivatives_by_all_parameters_are_those_of_differences(name: str) -> No
         value, misses = value_of(given, short), []
         # The wide step for derivatives that are nearly zero, the short one beside switches.
         for step in (1e-3 * value, 1e-4 * value):
-            near = [
-                ff.simulate(with_value(given, short, value + k * step), drive, TIME, 1e-10)
-                for k in (-2, -1, 1, 2)
-            ]
+            both = differences(partial(changed, given, drive, short), step)
             misses.append([])
-            for what in ("displacement", "base_stress"):
-                low, lower, higher, high = (getattr(r, what) for r in near)
-                wanted = (low - 8.0 * lower + 8.0 * higher - high) / (12.0 * step)
+            for what, wanted in zip(("displacement", "base_stress"), both, strict=True):
                 got = getattr(run.sensitivities[short], what)
                 size = max(np.abs(got).max(), 2e-5 * np.abs(getattr(run, what)).max() / abs(value))
                 misses[-1].append(np.abs(wanted - got)[..., away].max() / size)
@@ -246,12 +249,8 @@ def test_a_chain_may_start_loaded(moved: bool) -> None:
     assert loaded == pytest.approx([run.base_stress[0]] * 3, rel=1e-12)
     for short in names:
         value = value_of(given, short)
-        low, high = (
-            ff.simulate(with_value(given, short, value * k), drive, TIME, 1e-10)
-            for k in (1.0 - 3e-5, 1.0 + 3e-5)
-        )
-        for what in ("displacement", "base_stress"):
-            wanted = (getattr(high, what) - getattr(low, what)) / (6e-5 * value)
+        both = differences(partial(changed, given, drive, short), 3e-5 * value, 2)
+        for what, wanted in zip(("displacement", "base_stress"), both, strict=True):
             got = getattr(run.sensitivities[short], what)
             size = max(np.abs(got).max(), 1e-4 * np.abs(getattr(run, what)).max() / abs(value))
             assert np.abs(wanted - got).max() < 2e-6 * size, (short, what)

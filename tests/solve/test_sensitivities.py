@@ -1,6 +1,7 @@
 """Sensitivities computed with a simulation against central differences."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from foamfit.springs.chain import Drive
 from foamfit.springs.laws.record import BEGUN, HEAVIER, STRUCK
 from foamfit.springs.laws.record import MOVED as MOVED_BY
 from foamfit.springs.spring import Spring
+from reference import differences
 
 TIME = np.linspace(0.0, 8e-4, 81)
 SOFT = ff.BistableSpring(2e6, 60e6, -0.3446e6, 0.35, 0.71, 6.8e6, 1.05e6)
@@ -99,23 +101,14 @@ def test_sensitivities_against_differences(label: str) -> None:
             other = with_value(scene, name, size + by)
             return plan(other, drive, time).run(other.arrays.rows, other.arrays.heights, rtol)
 
-        def slope(step: float, size: float = size) -> tuple[np.ndarray, ...]:
-            up, down = (bare(sign * step * size) for sign in (1.0, -1.0))
-            return (
-                (up.displacement - down.displacement) / (2.0 * step),
-                (up.base_stress - down.base_stress) / (2.0 * step),
-            )
-
-        short = slope(step)
-        wide = slope(2.0 * step) if usual else short
+        wanted = differences(bare, step * size, 4 if usual else 2)
         own = got.sensitivities[name]
         ranges = (np.ptp(got.displacement[-1]), np.ptp(got.base_stress))
-        for one, two, exact, scale in zip(
-            short, wide, (own.displacement, own.base_stress), ranges, strict=True
+        for expected, exact, scale in zip(
+            wanted, (own.displacement, own.base_stress), ranges, strict=True
         ):
-            expected = (4.0 * one - two) / 3.0  # Richardson
-            allowed = 1e-6 * max(float(np.ptp(expected)), scale)
-            assert np.all(np.abs(size * exact - expected)[..., away] <= allowed), name
+            allowed = 1e-6 * max(abs(size) * float(np.ptp(expected)), scale)
+            assert np.all(np.abs(size * (exact - expected))[..., away] <= allowed), name
 
 
 def with_change(drive: Drive, what: int, by: float) -> Drive:
@@ -153,10 +146,8 @@ def test_derivatives_by_the_drive_against_differences(label: str) -> None:
     assert away.mean() > 0.8
     for k, what in enumerate(kinds):
         step = 2e-5 * SIZES[what]
-        one, two = ([run(what, way * s) for way in (1, -1)] for s in (step, 2.0 * step))
-        for name in ("displacement", "base_stress"):
-            short, wide = (getattr(up, name) - getattr(down, name) for up, down in (one, two))
-            expected = (8.0 * short - wide) / (12.0 * step)  # Richardson
+        wanted = differences(partial(run, what), step)
+        for name, expected in zip(("displacement", "base_stress"), wanted, strict=True):
             off = np.abs(getattr(got.slopes, name)[k] - expected)[..., away]
             if (what, name) == (MOVED_BY, "displacement"):
                 off = off[:-1]  # the top is prescribed

@@ -1,9 +1,4 @@
-"""Microscale springs with memory (docs/theory.md) against an independent implementation.
-
-`Formula` implements section 8 literally: the state is updated in small steps, the strain is
-explicit, and the stress at a strain is found by bracketing. `discrete` follows individual
-micro-springs.
-"""
+"""Microscale springs with memory (docs/theory.md) against an independent implementation."""
 
 import math
 from dataclasses import replace
@@ -13,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.random import Generator
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.special import ndtr
 
 import foamfit as ff
+from reference import Microscale, differences
 
 Array = NDArray[np.float64]
 PLAIN = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 1.3e6, 0.4, 5.5e5, 0.6)
@@ -32,60 +27,6 @@ SPRINGS = {
     "always reversible": replace(WORN, sigma_minus=3e6, spread_minus=0.4, weakening=0.0),
     "soft at first": replace(WORN, stiffening=0.3, eps_star=0.6),
 }
-
-
-class Formula:
-    """Section 8 with ranks w and W in place of p and P, so that 1 - P is accurate."""
-
-    def __init__(self, spring: ff.MicroscaleSpring) -> None:
-        self.spring, self.w, self.most = spring, -math.inf, -math.inf
-
-    def moved(self, s: float) -> tuple[float, float]:
-        p, first, back = self.spring, -math.inf, -math.inf
-        if s > 0.0:
-            first = math.log(s / p.sigma_plus) / p.spread_plus
-            back = math.log(s / p.sigma_minus) / p.spread_minus
-        least = max(first, min(first + p.weakening / p.spread_plus, self.most))
-        w = min(max(self.w, least), max(least, back))
-        return w, max(self.most, w)
-
-    def on_a(self, s: float, k: float) -> float:
-        n = self.spring.stiffening
-        return -math.expm1(-math.log1p(n * s / k) / n) if n * s > -k else -math.inf
-
-    def strain(self, s: float) -> float:
-        p, (w, most) = self.spring, self.moved(s)
-        never, once, snapped = ndtr(-most), ndtr(-w) - ndtr(-most), ndtr(w)
-        strain = never * self.on_a(s, p.k0)
-        if once > 0.0:
-            strain += once * self.on_a(s, p.k0 * math.exp(-p.softening))
-        return strain + snapped * (p.eps_star + s / (p.kc + s)) if snapped > 0.0 else strain
-
-    def stress(self, strain: float) -> float:
-        low, high = 0.0, self.spring.k0
-        if self.strain(0.0) > strain:  # in tension
-            low, high = -1e-9 * high, 0.0
-            while self.strain(low) > strain:
-                low *= 2.0
-        else:
-            while self.strain(high) < strain:
-                high *= 2.0
-            near = high
-            while near > 1e-280 and self.strain(near) > strain:  # bracket small roots closely
-                near *= 1e-3
-            low = near if self.strain(near) <= strain else 0.0
-        if self.strain(low) == strain:
-            return low
-        return float(
-            brentq(
-                lambda s: max(self.strain(s) - strain, -1e300), low, high,
-                xtol=1e-300, rtol=9e-16, maxiter=1000,
-            )
-        )  # fmt: skip
-
-    def keep(self, s: float, before: float) -> None:
-        for part in np.linspace(before, s, 5)[1:]:
-            self.w, self.most = self.moved(float(part))
 
 
 def between(rng: Generator, low: float, high: float) -> float:
@@ -143,25 +84,22 @@ def test_stress_and_strain_are_those_of_the_formula(extreme: bool) -> None:
         rng = np.random.default_rng([8, extreme, number])
         spring = drawn(rng, extreme)
         given = history(rng, spring)
-        along, before, strain, fractions = Formula(spring), 0.0, [], []
+        along, strain, fractions = Microscale(spring), [], []
         for s in given:
-            along.keep(s, before)
+            along.keep(s)
             strain.append(along.strain(s))
             fractions.append((ndtr(along.w), ndtr(along.most)))
-            before = s
         wanted = np.array(strain)
         assert np.abs(spring.strain(given) - wanted).max() <= 1e-12 * np.abs(wanted).max(), number
         found = spring.fractions_along(given)
         assert np.abs(np.transpose(found) - fractions).max() <= 1e-12, number
         assert spring.fraction_along(given).tolist() == found[0].tolist()
-        along, before, back, loose = Formula(spring), 0.0, [], []
+        along, back, loose = Microscale(spring), [], []
         for eps in wanted:
             digit = 8e-16 * abs(eps)
-            s = along.stress(eps)
+            back.append(along.stress(eps))
             loose.append(abs(along.stress(eps + digit) - along.stress(eps - digit)))
-            along.keep(s, before)
-            back.append(s)
-            before = s
+            along.keep(back[-1])
         got, allowed = spring.stress(wanted), 1e-9 * np.abs(given).max() + 2.0 * np.array(loose)
         assert (np.abs(got - back) <= allowed).all(), number
         assert (np.abs(got - given) <= allowed).all(), number  # stress inverts strain
@@ -250,15 +188,16 @@ def test_derivatives_are_those_of_differences(name: str, moved: bool, count: int
         drive = move if moved else ff.StressDrive(1e6 * shape)
         return ff.simulate(chain, drive, time, sensitivities=asked)
 
-    exact = run(spring, *names).sensitivities
+    found = run(spring, *names)
+    exact = found.sensitivities
     for full in names:
         short = full.removeprefix("s1_")
         value = getattr(spring, short)
-        low, high = (run(replace(spring, **{short: value * (1.0 + k)})) for k in (-1e-5, 1e-5))
-        for what in ("displacement", "base_stress"):
-            wanted = (getattr(high, what) - getattr(low, what)) / (2e-5 * value)
+        both = differences(lambda by, n=short, v=value: run(replace(spring, **{n: v + by})),
+                           1e-5 * value, 2)  # fmt: skip
+        for what, wanted in zip(("displacement", "base_stress"), both, strict=True):
             got = getattr(exact[full], what)
-            size = np.abs(getattr(low, what)).max() / value
+            size = np.abs(getattr(found, what)).max() / value
             close = 1e-6 * np.abs(got).max() + 1e-7 * size
             assert np.abs(got - wanted).max() <= close, (short, what)
 
@@ -278,8 +217,8 @@ def test_derivatives_behind_a_narrow_snap_that_all_have_passed() -> None:
     for full, got in exact.items():
         short = full.removeprefix("s1_")
         value = getattr(narrow, short)
-        low, high = (run(replace(narrow, **{short: value * (1.0 + k)})) for k in (-1e-5, 1e-5))
-        wanted = (high.displacement[0] - low.displacement[0]) / (2e-5 * value)
+        wanted = differences(lambda by, n=short, v=value: run(replace(narrow, **{n: v + by})),
+                             1e-5 * value, 2)[0][0]  # fmt: skip
         away = np.abs(wanted - got.displacement[0]) <= 1e-3 * np.abs(wanted).max()
         assert np.abs(wanted).max() > 1e-6
         assert away.all(), short
