@@ -38,7 +38,7 @@ sys.path += sorted(str(place) for place in HERE.iterdir() if place.is_dir())
 MICROSCALE = ("k0", "kc", "eps_star", "sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
 # Colours of Okabe and Ito, safe for colour-blind readers.
 BLACK, GREY, BLUE, SKY = "#000000", "#8c8c8c", "#0072B2", "#56B4E9"
-VERMILION, ORANGE, GREEN, PURPLE = "#D55E00", "#E69F00", "#009E73", "#CC79A7"
+VERMILION, ORANGE, GREEN = "#D55E00", "#E69F00", "#009E73"
 
 
 # ------------------------------------------------------------------------------- arguments
