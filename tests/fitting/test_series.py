@@ -44,7 +44,7 @@ def test_an_exchange_keeps_the_stresses_at_which_springs_snap(law, springs):
 def test_intervals_of_two_springs_hold_the_truth():
     """With 0.2 % noise, at least 85 % of the intervals contain the true value."""
     chain = ff.Chain([STIFF, SOFT], [0.005, 0.005], 4.5e-5)  # the fit must swap them
-    time = np.linspace(0.0, 4.0, 299)
+    time = np.linspace(0.0, 4.0, 151)
     motion = 0.0037 * (1.0 - np.abs(0.5 * time - 1.0))
     stress = ff.simulate(chain, ff.DisplacementDrive(motion), time).base_stress
     rng = np.random.default_rng(3)
@@ -68,10 +68,10 @@ def test_two_springs_are_found_in_a_loop_of_many_kinks(seed):
     """Starts drawn at random had no right kink for some branch: misfits of 2 %, in 5 of 8 seeds."""
     long = ff.BistableSpring(2.343e6, 1.337e8, -1.184e5, 0.2537, 0.4623, 3.286e6, 7.377e5)
     stiff = ff.BistableSpring(2.781e7, 4.918e8, -1.246e5, 0.07821, 0.1792, 4.263e6, 1.359e7)
-    chain, time = ff.Chain([long, stiff], [0.005, 0.005], 4.5e-5), np.linspace(0.0, 20.0, 300)
+    chain, time = ff.Chain([long, stiff], [0.005, 0.005], 4.5e-5), np.linspace(0.0, 20.0, 150)
     motion = 3.31e-3 * (1.0 - np.abs(time / 10.0 - 1.0))
     stress = ff.simulate(chain, ff.DisplacementDrive(motion), time).base_stress
-    noise = 5e-4 * np.random.default_rng(3).standard_normal((2, 300))
+    noise = 5e-4 * np.random.default_rng(3).standard_normal((2, 150))
     noisy = [x + np.ptp(x) * of_x for x, of_x in zip((stress, motion), noise, strict=True)]
     test = loop_measurement(*noisy, Specimen(0.01, 4.5e-5, heights=(0.005, 0.005)), time)
     result = ff.fit(test, model="bistable+bistable", seed=seed, intervals="local")
