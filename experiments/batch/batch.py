@@ -31,12 +31,14 @@ TEST = HERE.parent / "foam-1" / "model-1-2.0mps-reconstruction.csv"
 TESTS, TINY, MANY = 24, 200, 1000
 
 
-def make_tests(folder: Path, count: int, every: int = 1) -> None:
-    """Copy the test, or every n-th row of it (n is `every`), and write the common TOML."""
+def make_tests(folder: Path, count: int, linear: bool = False) -> None:
+    """Copy the test, or a tenth of its rows with a linear force, and write the common TOML."""
     folder.mkdir()
-    table = pd.read_csv(TEST, comment="#")[::every].to_csv(index=False)
+    table = pd.read_csv(TEST, comment="#")
+    if linear:
+        table = table[::10].assign(**{"force (N)": 200.0 * table["displacement (mm)"].clip(0.0)})
     for i in range(count):
-        (folder / f"t{i:05d}.csv").write_text(table)
+        table.to_csv(folder / f"t{i:05d}.csv", index=False)
     (folder.parent / "foam.toml").write_text(TEST.with_suffix(".toml").read_text())
 
 
@@ -107,8 +109,9 @@ def measure_overhead(place: Path) -> dict[str, Any]:
 
 def measure_memory(place: Path) -> dict[str, Any]:
     """Measure the resident memory of the processes during a batch of many tests."""
-    make_tests(place / "tests", MANY, every=10)
-    words = ("--starts", 1, "--model", "linear", "--no-report", "--jobs", 2, "--out", "out")
+    make_tests(place / "tests", MANY, linear=True)
+    words = ("--starts", 1, "--model", "linear", "--drive", "displacement", "--no-report")
+    words += ("--jobs", 2, "--out", "out")
     sizes, at = run(place, *words)[2], {}
     for wanted in (100, 500, MANY - 20):
         done, main, worker = min(sizes, key=lambda s, w=wanted: abs(s[0] - w))
