@@ -27,6 +27,7 @@ def _registry() -> Any:
     except OSError:
         registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
     registry.define("microstrain = 1e-6 = ustrain")
+    registry.define("px = pixel")  # of a camera; pint's is 1/96 inch
     return registry
 
 
@@ -34,6 +35,8 @@ def _registry() -> Any:
 def _unit(text: str) -> Any:
     """Return the unit as a pint quantity of magnitude 1, or None if pint does not know it."""
     text = text.strip().replace("·", "*").replace("^", "**")
+    if re.search(r"\d\d|\d\W+\d|\de[+-]?\d", text):  # "seed 2014", "x10 N", "1e3 N", "9**9**9"
+        return None
     text = re.sub(r"(?<=[A-Za-z])(-?\d)", r"**\1", text)  # m/s2
     if text in {"-", "–", "1"}:
         text = ""

@@ -20,7 +20,7 @@ from foamfit.data.measurement import MIN_ROWS, Dropped, Entry
 from foamfit.data.tables.headers import CHANNELS, Header, parse_header
 from foamfit.data.tables.layouts import blanks_as_tabs, scope_of, unpacked
 from foamfit.data.toml_file import LONGEST, read_bytes
-from foamfit.data.units import is_unit
+from foamfit.data.units import factor, is_unit
 from foamfit.errors import InputError, naming
 
 _HEAD_ROWS = 400
@@ -37,6 +37,8 @@ _OF_DAY = re.compile(
     re.IGNORECASE | re.ASCII,
 )
 DAY = 86400.0  # s
+# First bytes of UTF-16, with and without a byte order mark.
+_WIDE = {b"\xff\xfe|\xfe\xff": "utf-16", b".\0": "utf-16-le", b"\0.": "utf-16-be"}
 _ONE = "a file must contain one table with one header"
 _NO_THOUSANDS = "write the numbers with a decimal point and without separators"
 
@@ -101,8 +103,8 @@ def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
         if not raw.strip():
             raise InputError("the file is empty; it must contain a header and rows of numbers.")
         try:
-            wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-            text = raw.decode("utf-16", "replace") if wide else raw.decode("utf-8-sig")
+            wide = next((w for start, w in _WIDE.items() if re.match(start, raw, re.DOTALL)), "")
+            text = raw[: len(raw) // 2 * 2].decode(wide) if wide else raw.decode("utf-8-sig")
         except UnicodeDecodeError:
             text = raw.removeprefix(codecs.BOM_UTF8).decode("latin-1")
         text = text.lstrip("\ufeff")  # a converted file may have several byte order marks
@@ -261,7 +263,9 @@ def _unit_row(grid: list[list[str]], i: int) -> tuple[int, list[str]]:
     units = next((u for u in map(_units, [*grid[i + 1 : first], *grid[i - 1 : i]]) if u), [])
     for k, unit in enumerate(units[: len(texts)]):
         own = parse_header(texts[k]).unit
-        if unit and texts[k] and (own is None or not texts[k].endswith((")", "]"))):
+        bare = own is None or not texts[k].endswith((")", "]"))
+        other = bare or (is_unit(own or "") and factor(unit, own or "") not in (None, 1.0))
+        if unit and texts[k] and other:
             texts[k] = f"{texts[k]} ({unit})"
     return first, texts
 

@@ -42,11 +42,12 @@ _WORDS = {word for channel in CHANNELS.values() for word in channel.words}
 _BY_UNIT = {"spannung", "stauchung", "compression"}
 # Words for a displacement if no better name is present: travel of a machine, or a gap.
 _MOTION = {"extension", "gap", "travel", "stroke", "deflection", "crosshead", "position"}
-_MOTION |= {"traversenweg", "kolbenweg"}
+_MOTION |= {"deformation", "distance", "traversenweg", "kolbenweg"}
 # Words that change the meaning of a channel's name.
 _OTHER = {"std", "sd", "dev", "error", "err", "noise", "uncertainty", "rate", "specific", "energy"}
 _OTHER |= {"transverse", "transversal", "lateral", "radial", "hoop", "circumferential", "poisson"}
 _OTHER |= {"width", "diameter", "volumetric", "shear", "quer", "almansi", "kirchhoff"}
+_OTHER |= {"setpoint", "command", "cmd", "target", "demand", "soll", "sollwert"}
 # Words for strains and stresses other than engineering ones.
 _LOGARITHMIC = {"true", "logarithmic", "log", "ln", "hencky", "wahre", "wahr", "logarithmische"}
 _MEASURES = {
@@ -58,6 +59,7 @@ _PLAIN = {"engineering", "nominal", "compressive", "axial", "normal", "measured"
 _SIZES = {"height", "thickness", "length", "area"}  # words for the size of a specimen
 # Words in brackets that are not units.
 _ASIDE = _WORDS | _OTHER | _LOGARITHMIC | {"green", "lagrange", "cauchy", "natural"}
+_TIMES = re.compile(r"[x×]\d+|\d+[x×]")  # force x10 (N): of what unit is unclear
 # Units of mass that mean a weight if used for a force.
 WEIGHTS = {"lb": "lbf", "lbs": "lbf", "kg": "kgf", "kgs": "kgf"}
 
@@ -99,7 +101,9 @@ class Header:
             return None
         if len(rest) == 1 and rest[0] in words:
             return poor + (rest[0] != words[0])
-        if _OTHER & set(rest) or not all(word in words for word in named):
+        if _OTHER & set(rest) or any(map(_TIMES.fullmatch, rest)):
+            return None
+        if not all(word in words for word in named):
             return None
         if named:
             return poor + 2
