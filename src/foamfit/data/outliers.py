@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array, Integers, Mask
 from foamfit.data.measurement import MIN_ROWS, UNITS, NoiseLevel, Outliers, Record
-from foamfit.data.noise import estimated_noise, noise_level, quantum, robust_variance
+from foamfit.data.noise import (
+    estimated_noise,
+    noise_level,
+    quantum,
+    residual_filter,
+    robust_variance,
+)
 from foamfit.text import counted, engineering, percent
 
 # Spikes
@@ -27,8 +33,6 @@ _MOST = 0.02  # share of the samples: if more stand out, none is an outlier
 _FEWEST = 30  # samples of a record in which outliers can be found
 _WIDTH, _HALF = 9, 4  # samples of a local cubic, and on either side of its middle
 _PAUSE = 6.0  # a longer step, in usual steps, is a pause
-_OPEN = 0.1  # least share of a sample's deviation that remains in its residual
-_CHUNK = 50_000  # windows processed at once
 # Short gaps
 _JUMP, _NEARBY = 10.0, 31  # least jump at both ends, in median jumps of this many samples
 _MAX_RUN = 5  # longest gap, samples
@@ -64,13 +68,12 @@ def find_outliers(values: Array, time: Array | None = None) -> Mask:
         return np.zeros(n, dtype=bool)
     least = _LEAST * float(np.ptp(np.quantile(values, (0.005, 0.995))))
     at = np.arange(n, dtype=np.float64) if time is None else time
-    weights = _weights(at)
     wrong = _gaps(values, at)
     for _ in range(4):  # a large spike hides small ones next to it
         smooth = _bridged(values, wrong, at)
         if is_staircase(smooth):
             break
-        found = _spikes(smooth, least, at, weights) & ~wrong
+        found = _spikes(smooth, least, at) & ~wrong
         if not found.any():
             break
         wrong |= found
@@ -101,47 +104,28 @@ def _gaps(values: Array, time: Array) -> Mask:
     return out
 
 
-def _spikes(values: Array, least: float, time: Array, weights: Array) -> Mask:
-    """Find samples far from the cubic through their eight neighbours; see `_weights`."""
+def _spikes(values: Array, least: float, time: Array) -> Mask:
+    """Find samples far from the cubic through their eight neighbours, none of them at a pause."""
     from scipy.ndimage import maximum_filter1d
     from scipy.special import ndtri
 
-    out, own = np.zeros(values.size, dtype=bool), np.maximum(weights[:, _HALF], 1e-12)
-    residual = np.einsum("ws,ws->w", weights, sliding_window_view(values, _WIDTH)) / own
-    usual = np.sqrt(robust_variance(residual * np.sqrt(own)) / own)
-    size, off = np.abs(residual), -ndtri(0.5 * _RARE / values.size)
+    out, weights = np.zeros(values.size, dtype=bool), residual_filter(_WIDTH)[0]
+    size = np.abs(np.convolve(values, weights, "valid")) / (own := float(weights[_HALF]))
+    steps = sliding_window_view(np.diff(time), _WIDTH - 1)
+    size[steps.max(axis=1) > _PAUSE * float(np.median(steps))] = 0.0
+    most = max(least, -float(ndtri(0.5 * _RARE / values.size)) * robust_variance(size) ** 0.5)
     # A spike also increases the residuals of its neighbours: only the largest of five is one.
     largest = size >= maximum_filter1d(size, 5, mode="constant")
-    for i in np.flatnonzero((size > np.maximum(off * usual, least)) & largest):
+    for i in np.flatnonzero((size > most) & largest):
         y, t = values[i : i + _WIDTH], time[i : i + _WIDTH] - time[i + _HALF]
-        rest = np.polyfit(np.delete(t, _HALF), np.delete(y, _HALF), 3, full=True)[1][0]
-        alone = np.sqrt(rest / (_WIDTH - 5) / own[i])
+        cubic, rest, *_ = np.polyfit(np.delete(t, _HALF), np.delete(y, _HALF), 3, full=True)
+        off = y[_HALF] - cubic[-1]  # not ± `size` if the clock is uneven
+        alone = np.sqrt(rest.sum() / (_WIDTH - 5) / own)
         # The tip of a kink lies on the line through the samples on one side.
         lines = (np.polyfit(t[side], y[side], 1)[1] for side in (slice(1, 4), slice(5, 8)))
-        above = min((y[_HALF] - line) * np.sign(residual[i]) for line in lines)
-        out[i + _HALF] = size[i] > _ALONE * alone and above > 0.5 * size[i]
+        above = min((y[_HALF] - line) * np.sign(off) for line in lines)
+        out[i + _HALF] = abs(off) > max(most, _ALONE * alone) and above > 0.5 * abs(off)
     return out
-
-
-def _weights(time: Array) -> Array:
-    """Return the weights (windows, samples) of "sample minus local cubic".
-
-    Weights are zero if the window spans a pause or the cubic depends on its middle sample alone.
-    """
-    windows = sliding_window_view(time, _WIDTH)
-    weights = np.empty(windows.shape)
-    for first in range(0, len(windows), _CHUNK):  # to limit memory
-        x = windows[first : first + _CHUNK] - windows[first : first + _CHUNK, [_HALF]]
-        powers = (x / np.abs(x).max(axis=1, keepdims=True))[:, :, None] ** np.arange(4)
-        # The last term matters only where uneven steps leave a window singular.
-        squares = powers.swapaxes(1, 2) @ powers + 1e-12 * np.eye(4)
-        at_middle = np.linalg.solve(squares, np.eye(4)[:, :1])
-        weights[first : first + _CHUNK] = -(powers @ at_middle)[:, :, 0]
-    weights[:, _HALF] += 1.0
-    step = np.diff(time)
-    pause = sliding_window_view(step, _WIDTH - 1).max(axis=1) > _PAUSE * float(np.median(step))
-    untested = pause | (weights[:, _HALF] < _OPEN)
-    return np.where(untested[:, None], 0.0, weights)
 
 
 def bridge_outliers(record: Record) -> Record:
