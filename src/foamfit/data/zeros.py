@@ -145,9 +145,6 @@ def take_zeros(
             value = engineering(zero.value, unit)
             value += f" ± {engineering(zero.error, unit)}" if sensor else ""
             record = record.noted(f"The {name} at contact, {value}, is taken off ({how}).")
-        elif sensor and start.first and not known:
-            kept = f"the zero of the {name} in the file is kept"
-            record = record.noted(f"Only {n} rows are certainly before contact: {kept}.")
         record = record.shifted(name, zero.value)
     return replace(record, zeros=errors)
 
@@ -319,8 +316,8 @@ def contact_end(stress: Array, noise: NoiseLevel) -> tuple[int, bool]:
 
     Contact is the one with the highest stress. It ends at the last return to zero of a moving mean,
     wide enough for a noise of half a percent of the peak if the pulse is long enough. Contact
-    continues if the stress soon rises again, or if its mean over the next quarter of the time since
-    the peak is significantly above zero.
+    continues if the mean over the next quarter of the time since the peak is significantly above
+    zero.
     """
     top = int(np.argmax(stress))
     peak = float(stress[top])
@@ -341,12 +338,7 @@ def contact_end(stress: Array, noise: NoiseLevel) -> tuple[int, bool]:
         if not quiet.size:  # the record may be cut just at the end of contact
             return len(stress), bool(stress[-1] <= 0.02 * peak + level)
         end += int(quiet[0])
-        ahead = end + max(1, (end - top) // 5)
-        again = np.flatnonzero(mean[end:ahead] > 0.05 * peak)
         tail = stress[end : end + max(4 * width, (end - top) // 4)]
-        if again.size:
-            end += max(1, int(again[-1]))
-        elif len(tail) > width and tail.mean() > zero(len(tail)):
-            end += 1
-        else:
+        if len(tail) <= width or tail.mean() <= zero(len(tail)):
             return end, True
+        end += 1
