@@ -96,6 +96,7 @@ def inside(*factors, offset=0.0):
         ("displacement_1_um", 1000),
         ("disp_1 (um)", 1000),
         ("camera displacement 01 / mm", 1),
+        ("displacement_1 (mil)", 1 / 0.0254),  # a thousandth of an inch
     ],
 )
 def test_a_mass_inside_is_read(tmp_path, header, scale):
