@@ -40,6 +40,7 @@ def expect(test):
         "time (ms),stress (MPa),displacement (mm)",
         "Time [ms],Stress[MPa],DISPLACEMENT (mm)",
         "time_ms,stress_MPa,displacement_mm",
+        "time_ms_,stress_MPa_,displacement_mm_",
         "t (ms) , sigma (MPa) , disp (mm)",
         "TIME (MS),STRESS (MPA),DISPLACEMENT (MM)",
         "Time / ms,Nominal stress / N/mm^2,Top displacement / mm",

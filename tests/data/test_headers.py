@@ -25,6 +25,8 @@ FIRST, NAMES = "Compression of a foam, sample 3", "Time,Force,Displacement"
         [NAMES, "s,N,mm", "double,double,double"],
         [NAMES, "measured,measured,measured", "s,N,mm"],
         [NAMES, "s,N,mm", "-----,-----,-----"],
+        [NAMES, "s,N,mm", ",Sensor A,"],
+        ["Time (s),Force,Displacement (mm)", ",N,"],
         ["s,N,mm", NAMES],
         [FIRST, "s,N,mm", NAMES],
         ['\ufeff"Time\n(s)","Force\n(N)","Displacement\n(mm)"'],

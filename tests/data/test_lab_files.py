@@ -51,12 +51,10 @@ def test_bluehill_universal(tmp_path):
     ]
     body = rows(TIME, MOTION, FORCE / 1e3, 10 * MOTION, FORCE / 100, form=".9f")
     lines = [*head, *('"' + row.replace(",", '","') + '"' for row in body)]
-    test = read_test(write(tmp_path, lines))
-    expect(test)
+    expect(test := read_test(write(tmp_path, lines)))
     assert "strain from 'Compressive strain (Displacement) (%)'" in test.notes[0]
     named = 'strain = { column = "Compressive strain (Displacement)" }\n'
-    test = read_test(write(tmp_path, lines, COLUMNS + named))
-    expect(test)
+    expect(test := read_test(write(tmp_path, lines, COLUMNS + named)))
     assert "displacement from" not in test.notes[0]
     assert any("displacement 'Displacement (mm)' is left out; it differs" in n for n in test.notes)
 
@@ -99,8 +97,7 @@ def test_a_german_voltage_is_no_stress(tmp_path, unit):
 )
 def test_columns_may_be_separated_by_blanks(tmp_path, head, decimal):
     lines = [*head, *rows(TIME, FORCE, MOTION, sep="   ", decimal=decimal)]
-    test = read_test(write(tmp_path, lines))
-    expect(test)
+    expect(test := read_test(write(tmp_path, lines)))
     assert test.rows.rows == N
 
 
@@ -171,10 +168,12 @@ def test_columns_of_fixed_width(tmp_path):
         width.format(f"{t:.2f}", f"{f:.5f}", f"{w:.6f}", 1)
         for t, f, w in zip(TIME, FORCE, MOTION, strict=True)
     ]
-    path = write(tmp_path, [*head, *body])
-    expect(read_test(path))
+    expect(read_test(write(tmp_path, [*head, *body])))
     gap = [*body[:20], body[20][:10] + 18 * " " + body[20][28:], *body[21:]]
     refused(write(tmp_path, [*head, *gap]), "row 23", "'Standard force (N)' is empty")
+    for first in (0, 100):  # R does not name the column of row numbers
+        numbered = [f"{i} {row}" for i, row in enumerate(rows(TIME, FORCE, MOTION, sep=" "), first)]
+        refused(write(tmp_path, ["time_s force_N displacement_mm", *numbered]), "row 2 has 4 cells")
 
 
 @pytest.mark.parametrize("sep", [",", ";", "\t", " ", "|"])
@@ -499,14 +498,12 @@ def test_a_record_that_runs_backwards(tmp_path):
     header, *body = (line.partition(",")[2] for line in PLAIN)
     out = run("check", str(write(tmp_path, [header, *body[::-1]])))
     assert "the record runs backwards" in " ".join(out.stdout.split())
-    half = body[: N // 2][::-1]
-    test = read_test(write(tmp_path, [header, *half]))
+    test = read_test(write(tmp_path, [header, *body[: N // 2][::-1]]))
     assert any("starts under load" in note for note in asked(test))
 
 
 def test_force_and_motion_swapped(tmp_path):
-    lines = ["time (s),force (N),displacement (mm)", *rows(TIME, 50 * MOTION, FORCE / 50)]
-    out = run("check", str(write(tmp_path, lines)))
+    out = run("check", str(write(tmp_path, [PLAIN[0], *rows(TIME, 50 * MOTION, FORCE / 50)])))
     assert "force and motion are swapped" in " ".join(out.stdout.split())
 
 

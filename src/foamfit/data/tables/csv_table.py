@@ -284,7 +284,7 @@ def _is_words(cells: list[str]) -> bool:
     filled = list(filter(None, cells))
     rule = re.fullmatch(r"[-=+:|\s]*[-=]{3}[-=+:|\s]*", "".join(cells)) is not None
     missing = {"n/a", "na", "nan", "null", "none", "inf"}
-    words = len(filled) > 1 and not any(re.match(r"[+-]?[.,]?\d", cell) for cell in filled)
+    words = bool(filled) and not any(re.match(r"[+-]?[.,]?\d", cell) for cell in filled)
     return rule or (words and not {cell.casefold() for cell in filled} & missing)
 
 

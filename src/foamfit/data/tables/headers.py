@@ -133,7 +133,7 @@ def parse_header(text: str) -> Header:
         elif (other := parse_header(name).unit) and is_unit(other) and other != unit:
             unit = f"{other} or {unit}"  # force (N) (kN): which one is right is unknown
         return Header(text, _words(name), unit)
-    tokens = re.split(r"[\s_]+", text)
+    tokens = re.split(r"[\s_]+", text.rstrip("_"))  # time_s_, as MATLAB writes time (s)
     for i in range(1, len(tokens)):
         rest = tokens[i:]
         if rest[0].lower() in _WORDS or rest[0].isdigit():

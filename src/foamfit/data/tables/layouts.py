@@ -137,9 +137,11 @@ def blanks_as_tabs(text: str) -> str | None:
 
 
 def _placed(line: str, places: list[tuple[int, int]]) -> list[str]:
-    """Assign each word of a line to the nearest column."""
+    """Assign each word of a line to the nearest column; all if one is above several columns."""
     cells: list[list[str]] = [[] for _ in places]
     for word in _TOKEN.finditer(line):
-        gaps = [max(start - word.end(), word.start() - end, 0) for start, end in places]
+        gaps = [max(start - word.end(), word.start() - end) for start, end in places]
+        if sum(gap < 0 for gap in gaps) > 1:
+            return line.split()
         cells[gaps.index(min(gaps))].append(word[0])
     return [" ".join(cell) for cell in cells]
