@@ -375,14 +375,19 @@ def test_a_wrong_call_is_one_sentence_and_writes_nothing(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_result_without_a_card_is_refused(tmp_path: Path, fit: Path) -> None:
+def test_a_result_without_a_card_is_refused(tmp_path: Path, fit: Path, joint: Path) -> None:
     linear = {"s1_k0": fabricated.estimate("s1_k0", 1e6)}
     write_fit(tmp_path / "linear", 0.25, model="linear", relaxation=0, parameters=linear)
     shutil.copytree(fit, tmp_path / "older")
     older = json.loads((fit / "fit.json").read_text())
     del older["load"]
     (tmp_path / "older" / "fit.json").write_text(json.dumps(older))
+    shutil.copytree(joint, tmp_path / "apart")
+    together = json.loads((joint / "joint.json").read_text())
+    together["parameters"]["s1_kc"]["value"] = 4e9  # eps_star is too small for it
+    (tmp_path / "apart" / "joint.json").write_text(json.dumps(together))
     for result, words in (
+        (tmp_path / "apart", "the common values of its tests are not a spring"),
         (tmp_path / "linear", "has no hysteretic spring"),
         (tmp_path / "older", "fit the test again"),
         (tmp_path / "nothing", "is not a result folder"),

@@ -24,7 +24,7 @@ from scipy.signal import savgol_filter
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Specimen
-from foamfit.errors import SimulationError
+from foamfit.errors import InputError, SimulationError
 from foamfit.solve.simulation import Response, simulate
 from foamfit.springs.chain import DisplacementDrive
 from foamfit.study.identified import Source
@@ -86,7 +86,15 @@ def follow(
     heights = [one.value for name, one in source.parameters.items() if name.endswith("_height")]
     height = sum(heights) or 1.0  # a single spring of any height has the same stress
     population = Population(source, Specimen(height, 1.0), rate)
-    chain = source.model.chain(population.point, height, 1.0)
+    try:
+        chain = source.model.chain(population.point, height, 1.0)
+    except InputError as error:
+        if not source.joint:
+            raise
+        raise InputError(
+            f"{source.where}: the common values of its tests are not a spring ({error}). Its tests "
+            "may be of different foams; give the folder of one of them"
+        ) from None
     return simulate(chain, DisplacementDrive(strain * height), time, sensitivities=names)
 
 
