@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,11 +30,13 @@ from foamfit.springs.parameters import NUISANCE
 from foamfit.study.identified import NORMAL
 from foamfit.trust.checklist import may_vanish
 from foamfit.trust.covariance import NOTHING, WEAK
+from foamfit.trust.intervals import FAR, HARDLY_WORSE
 from foamfit.trust.ranges import ALIKE
 
 TINY, ROUNDING = 1e-6, 1e-12  # least information on a scaled parameter, and over the largest one
 LONGEST = 30.0  # longest contact, in times that the striker takes over the height of the specimen
 TIMED = 20  # number of draws from which the duration of an impact is taken
+UNKNOWN = 2.0 * NOTHING  # half an interval where a branch is not reached, in scales
 # Quantities of `Target`; the absorbed energy is that up to the largest strain.
 UNITS = {"peak_force": "N", "absorbed_energy": "J", "dissipated_energy": "J", "peak_strain": ""}
 
@@ -46,7 +49,8 @@ class Known:
     tests about equally well, `bread` (d, k, k) is JᵀJ there and `meat` JᵀΣJ: slopes in a draw may
     differ much from those of the fit. `missed` is the sum of squares of the model error, `share`
     its RMS over the range of each curve, `stretch` (k,) the ranges of the fits over those to first
-    order, at least 1, `reached` (k,) whether the branch of each parameter was reached.
+    order, at least 1, `reached` (d, k) whether the branch of each parameter was reached.
+    `explained` (m, n) are springs in series that explain the tests in other ways, see `draws`.
     """
 
     problem: Problem
@@ -60,6 +64,7 @@ class Known:
     stretch: Array
     reached: Mask
     draws: Array
+    explained: Array | None = None
 
     @cached_property
     def drawn_sizes(self) -> Array:
@@ -70,6 +75,14 @@ class Known:
         """Return the parameters of another test: drawn springs, and its nuisance parameters."""
         count = len(self.problem.model.names)
         return np.append(drawn[:count], problem.vector()[count:])
+
+
+class Refit(NamedTuple):
+    """Other springs fitted to the records of a drawn foam; see `others`."""
+
+    values: Array  # (k,), scaled
+    rise: float  # of the sum of squares
+    reached: Mask  # (k,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +96,7 @@ class Seen:
     missed: Array  # (d,): sum of squares of the model error
     force: float  # median of the largest force, N
     apart: dict[str, float] = field(default_factory=dict)  # χ² by which it excludes each rival
+    others: tuple[tuple[Refit, ...], ...] = ()  # that follow the records of each draw as well
 
 
 def rows_of(problem: Problem, values: Array, names: tuple[str, ...], sizes: Array) -> Array:
@@ -257,16 +271,19 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
     clear, limits = np.abs(values) > wider, [known.problem.params[n] for n in known.names]
     least, most = np.array([(one.min, one.max) for one in limits]).T / known.sizes
     # As in a fit, an interval ends at the limits of its parameter.
-    widths = np.minimum(values + halves, most) - np.maximum(values - halves, least)
-    shares = halves / known.drawn_sizes
+    low, high, elsewhere = _with_others(known, seen, values, halves)
+    widths = np.minimum(high, most) - np.maximum(low, least)
+    shares = 0.5 * (high - low) / known.drawn_sizes
+    wide = np.maximum(wide, shares)  # and, to one side, another minimum
+    side = np.maximum(wide, np.maximum(high - values, values - low) / known.drawn_sizes)
     reached = np.broadcast_to(known.reached, halves.shape)
     for one in seen:
         reached = reached | one.reached
     out = dict[str, Expected]()
     for i, name in enumerate(known.names):
         shown = reached[:, i]
-        sure = clear[:, i] if may_vanish(name) else True
-        chance = float(np.mean(shown & (wide[:, i] <= WEAK) & sure))
+        sure = ~elsewhere[:, i] & (clear[:, i] if may_vanish(name) else True)
+        chance = float(np.mean(shown & (side[:, i] <= WEAK) & sure))
         some = float(np.mean(shown & (wide[:, i] <= NOTHING)))
         state = "determined" if chance >= 0.5 else "weak" if some >= 0.5 else "not determined"
         ends, share = np.full(3, math.nan), math.nan
@@ -276,6 +293,31 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
         low, middle, high = ends.tolist()
         out[name] = Expected(middle, state, (low, high), chance, share)
     return out
+
+
+def _with_others(
+    known: Known, seen: Sequence[Seen], values: Array, halves: Array
+) -> tuple[Array, Array, Mask]:
+    """Return the ends of intervals, and whether values far outside fit almost as well, (d, k).
+
+    The rule is that of a joint fit (`joint_fit`); intervals extend to other springs that noise
+    could make the best.
+    """
+    low, high, elsewhere = values - halves, values + halves, np.zeros(values.shape, dtype=bool)
+    for one in seen:
+        for i, refits in enumerate(one.others):
+            noise = np.trace(known.meat[i] + one.meat[i]) / np.trace(known.bread[i] + one.bread[i])
+            near = [(x, x.rise / (NORMAL**2 * noise)) for x in refits]
+            for other, rise in near:
+                if rise < 1.0:
+                    half = np.where(other.reached, halves[i] * math.sqrt(1.0 - rise), UNKNOWN)
+                    low[i] = np.minimum(low[i], other.values - half)
+                    high[i] = np.maximum(high[i], other.values + half)
+            for other, rise in near:
+                if rise <= HARDLY_WORSE**2:
+                    apart = np.maximum(low[i] - other.values, other.values - high[i])
+                    elsewhere[i] |= apart > FAR * (high[i] - low[i])
+    return low, high, elsewhere
 
 
 def no_worse(found: dict[str, Expected], now: dict[str, Expected]) -> dict[str, Expected]:

@@ -9,67 +9,46 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from itertools import combinations
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from foamfit.api import FitResult
-from foamfit.arrays import Array, Mask, single_threaded
+from foamfit.arrays import Array, single_threaded
 from foamfit.data.measurement import MEASURED, Measurement, Noise, Specimen, Striker
 from foamfit.data.rig import Candidate, Rig, beyond, candidates, read_rig
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting.box import Space
 from foamfit.fitting.branches import unreached
 from foamfit.fitting.minimizer import problem_of
 from foamfit.fitting.nuisance import VELOCITY
-from foamfit.fitting.problem import Problem, make_params, make_problem
+from foamfit.fitting.problem import make_params, make_problem
+from foamfit.fitting.search import has_several
 from foamfit.one_model import Progress
 from foamfit.parts import rung_name
 from foamfit.report.studies.plan import RISKY, Expected, Outcome, Plan, Quantity
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Chain, Impact
-from foamfit.springs.parameters import NUISANCE
 from foamfit.springs.published import published
 from foamfit.study import gain
+from foamfit.study.draws import Test, known_of
 from foamfit.study.gain import Known, Seen
 from foamfit.study.joint_result import JointResult
+from foamfit.study.others import others_of, with_others
 from foamfit.study.saved import load, with_record
 from foamfit.text import counted
-from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import NOTHING
-from foamfit.trust.ranges import ALIKE, tolerance
 
 DRAWS = 40  # number of drawn foams
-TRIES = 60  # attempts per draw
+FEWER_DRAWS = 16  # the same for springs in series, each of which is fitted in other ways
 NEARLY = 0.1  # tests that determine this many parameters fewer, on average, count as equal
 # What a softer test may lose: parameters, on average, and this share of the width of intervals. A
 # faster one is also more likely to break the rig: with 0.1, fewer parameters were determined.
 FEWER, WIDER = 0.5, 0.05
-PAIRED = 20  # number of tests whose pairs are compared
 TOLD_APART = 9.0  # rise of χ² at which a test tells two laws apart
 # The closing velocity is sought at SPEEDS down to a SLOWEST part of the largest; then its interval
 # is halved.
 SPEEDS, SLOWEST, HALVINGS = 18, 40.0, 8
-
-
-@dataclass(frozen=True, eq=False)
-class Test:
-    """A test at hand: its problem and parameters, its result if it was measured, and its study."""
-
-    problem: Problem
-    values: Array
-    fit: FitResult | None = None
-    study: str = ""  # name of the joint fit that it belongs to
-
-    def with_springs(self, drawn: Array) -> Array:
-        """Return its parameters with drawn springs."""
-        count = len(self.problem.model.names)
-        return np.append(drawn[:count], self.values[count:])
 
 
 @single_threaded
@@ -112,31 +91,38 @@ def plan(
     rng, test = np.random.default_rng(seed), tests[0].problem.measurement
     limits, asked = _candidates(tests[0], rivals, rig)
     progress(0.0, "drawing what the tests leave open")
-    known = known_of(tests, rng, DRAWS)
+    several = has_several(tests[0].problem.model)
+    known = known_of(tests, rng, FEWER_DRAWS if several else DRAWS)
     others = {name: known_of([one], rng, 0) for name, one in rivals.items()}
     target = None if quantity is None else gain.Target.of(quantity, known, limits)
 
     def look(i: int, one: Candidate) -> Seen:
-        progress(0.05 + 0.85 * i / len(asked), f"{counted(len(asked), 'candidate')}, {i} done")
+        progress(0.05 + 0.65 * i / len(asked), f"{counted(len(asked), 'candidate')}, {i} done")
         return gain.look(known, one, limits, others)
 
-    seen = list(map(look, range(len(asked)), asked))
-
+    now = _now(known, tests)
     contradicted = known.missed > 0.0 and any(x.fit and x.fit.contradictions for x in tests)
 
-    def outcome(one: Candidate, *more: Seen) -> Outcome:
-        risk = np.any([each.broken for each in more], axis=0)
-        error = None if target is None else target.error(known, more)
-        found = gain.no_worse(gain.expected(known, more), now)
+    def outcome(one: Candidate, shown: Seen) -> Outcome:
+        error = None if target is None else target.error(known, [shown])
+        found = gain.no_worse(gain.expected(known, [shown]), now)
         if contradicted and one.drive == "impact":  # as in a fit, where the law errs as well
             found = {name: x.capped() for name, x in found.items()}
-        return Outcome(one, float(np.mean(risk)), found, more[0].force, error, more[0].apart)
+        return Outcome(one, float(np.mean(shown.broken)), found, shown.force, error, shown.apart)
 
-    now = _now(known, tests)
-    outcomes = [outcome(one, what) for one, what in zip(asked, seen, strict=True)]
-    safe = [i for i, one in enumerate(outcomes) if one.breaks <= RISKY]
-    best = _advised(outcomes, safe, sum(one.probability for one in now.values())) if safe else None
-    pair = _pair(known, outcomes, seen, safe)
+    def judged(seen: Sequence[Seen]) -> tuple[list[Outcome], list[int], int | None]:
+        outcomes = list(map(outcome, asked, seen))
+        safe = [i for i, one in enumerate(outcomes) if one.breaks <= RISKY]
+        known_now = sum(one.probability for one in now.values())
+        return outcomes, safe, _advised(outcomes, safe, known_now) if safe else None
+
+    seen = list(map(look, range(len(asked)), asked))
+    outcomes, safe, best = judged(seen)
+    if best is not None and known.explained is not None:
+        progress(0.7, "other springs that would show the same")
+        each = others_of(known, tests, asked[best], limits)
+        pairs = zip(asked, seen, strict=True)
+        outcomes, safe, best = judged([with_others(known, each, *x, limits) for x in pairs])
     progress(0.92, "what no test of this rig determines")
     shown = [now, *(outcomes[i].expected for i in safe)]
     sure = {name for each in shown for name, one in each.items() if one.state == "determined"}
@@ -152,7 +138,6 @@ def plan(
         now=now,
         outcomes=tuple(outcomes),
         advice=None if best is None else outcomes[best],
-        pair=pair and (outcome(asked[pair[0]], *(seen[i] for i in pair)), asked[pair[1]]),
         never=never,
         closing={mass: _closing(known, mass, limits) for mass in limits.masses},
         quantity=None
@@ -250,141 +235,6 @@ def _published(name: str) -> Test:
     return Test(problem, values)
 
 
-def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Known:
-    """Return what some tests of one foam say about the parameters of its springs."""
-    first = tests[0].problem
-    names = tuple(name for name in first.free() if name not in NUISANCE)
-    k, sizes = len(names), first.sizes(names, tests[0].values)
-    missed, share, reached, roots = _of_fits(tests, names)
-
-    def said(t: int, values: Array) -> tuple[Array, Array]:
-        rows = gain.rows_of(tests[t].problem, values, names, sizes)
-        return gain.information(gain.without_nuisance(rows, k), roots[t])
-
-    found_by = [said(t, one.values) for t, one in enumerate(tests)]
-    breads, meats = (np.array(each) for each in zip(*found_by, strict=True))
-    values = _mean_of(tests, names, sizes, breads)
-    both = breads.sum(axis=0)[None], meats.sum(axis=0)[None]
-    known = Known(
-        first, values, names, sizes, *both, missed, share, np.ones(k), reached, values[None]
-    )
-    known = replace(known, stretch=_stretch(known, tests))
-    if not draws:
-        return known
-    drawn = _draws(known, tests, rng, draws)
-    bread, meat = np.repeat(known.bread, draws, axis=0), np.repeat(known.meat, draws, axis=0)
-    for i, one in enumerate(drawn):
-        with suppress(SimulationError):  # a coarser simulation had followed the test
-            own = [said(t, test.with_springs(one)) for t, test in enumerate(tests)]
-            bread[i], meat[i] = np.sum(own, axis=0)
-    return replace(known, draws=drawn, bread=bread, meat=meat)
-
-
-def _of_fits(
-    tests: Sequence[Test], names: Sequence[str]
-) -> tuple[float, dict[str, float], Mask, Array]:
-    """Return `missed`, `share` and `reached` of `Known`, and what `information` needs of each fit.
-
-    A simulated test has neither noise nor model error.
-    """
-    missed, share = 0.0, dict[str, list[float]]()
-    reached, roots = np.zeros(len(names), dtype=bool), np.ones((len(tests), len(names)))
-    for t, one in enumerate(tests):
-        best, objective = BestPoint(one.problem, one.values), one.problem.objective
-        reached |= np.array([name not in best.unreached for name in names])
-        if one.fit is None:
-            continue
-        missed += tolerance(best) / (ALIKE**2 - 1.0)
-        for curve, error in zip(objective.counted, best.errors, strict=True):
-            share.setdefault(curve, []).append(error.law / max(objective.span(curve), 1e-300))
-        for name, found in zip(best.names, best.spread.inflation.tolist(), strict=True):
-            if name in names and math.isfinite(found):
-                roots[t, names.index(name)] = math.sqrt(found)
-    return missed, {curve: float(np.mean(each)) for curve, each in share.items()}, reached, roots
-
-
-def _mean_of(tests: Sequence[Test], names: Sequence[str], sizes: Array, breads: Array) -> Array:
-    """Return the mean parameters of the tests, weighted by the information in each."""
-    first = tests[0].problem
-    values, places = tests[0].values, [first.index[name] for name in names]
-    if len(tests) == 1:
-        return values
-    pull = [b @ (one.values[places] / sizes) for b, one in zip(breads, tests, strict=True)]
-    values = values.copy()
-    values[places] = sizes * (np.linalg.pinv(breads.sum(axis=0), rcond=1e-10) @ sum(pull))
-    return first.space().decode(first.space().encode(values))
-
-
-def _stretch(known: Known, tests: Sequence[Test]) -> Array:
-    """Return the widest range of each parameter in the fits over that to first order, (k,)."""
-    law = np.sqrt(np.maximum(np.diagonal(gain.covariance(known, [])[1][0]), 0.0))
-    out = np.ones(law.size)
-    for fit in (one.fit for one in tests if one.fit is not None):
-        for i, name in enumerate(known.names):
-            if (found := fit.parameters[name].range) is not None and law[i] > 0.0:
-                half = 0.5 * (found[1] - found[0]) / known.sizes[i]
-                out[i] = max(out[i], half / law[i])
-    return out
-
-
-def _draws(known: Known, tests: Sequence[Test], rng: np.random.Generator, count: int) -> Array:
-    """Return vectors of parameters that follow the tests about as well as the best one.
-
-    Parameters whose branch was reached are drawn from their covariance, including model error, and
-    the others from what the law calls likely, or from the limits of the search; a published set is
-    known but for the former. A draw that raises the cost by more than noise and model error allow
-    is drawn again, nearer to the best point.
-    """
-    problem, k = known.problem, len(known.names)
-    space, at = problem.space(), np.array([problem.index[name] for name in known.names])
-    measured = any(one.fit is not None for one in tests)
-    open_ = at[np.logical_not(known.reached) & measured]
-    allowed, prior = (ALIKE**2 - 1.0) * known.missed, np.eye(k) / NOTHING**2
-    inverse = np.linalg.inv(known.bread[0] + prior)
-    spread = inverse @ (known.meat[0] + prior) @ inverse + allowed / 1.96**2 * inverse
-    power, axes = np.linalg.eigh(spread)
-    axes = np.where(known.reached[:, None], axes * np.sqrt(np.maximum(power, 0.0)), 0.0)
-    best = space.encode(known.values)  # steps are taken in the coordinates of the search
-    slopes = space.slopes(best, known.values)[at] / known.sizes[:, None]
-    axes = np.linalg.lstsq(slopes, axes, rcond=1e-12)[0]
-    thin, n_springs = [one.problem.thinned().objective for one in tests], len(problem.model.names)
-
-    def cost(values: Array) -> float:
-        own = zip(thin, (one.with_springs(values) for one in tests), strict=True)
-        return sum(float(np.sum(objective.residual(v) ** 2)) for objective, v in own)
-
-    noise = float(np.max(np.diag(known.meat[0]) / np.maximum(np.diag(known.bread[0]), 1e-300)))
-    most = cost(known.values) + allowed + max(noise, 1.0) * float(stats.chi2.ppf(0.99, k))
-    out = np.repeat(known.values[None], count, axis=0)
-    for i in range(count):
-        for step in 0.95 ** np.arange(TRIES):
-            point = np.clip(best + step * axes @ rng.normal(size=k), *space.box)
-            values = _with_open(problem, space, space.decode(point), open_, rng)
-            values[n_springs:] = known.values[n_springs:]
-            if cost(values) <= most:
-                out[i] = values
-                break
-    return out
-
-
-def _with_open(
-    problem: Problem, space: Space, values: Array, open_: Array, rng: np.random.Generator
-) -> Array:
-    """Return parameters within their limits, with random ones at the places `open_`."""
-    for i, law in enumerate(problem.model.laws):
-        own = problem.model.own(i, values)
-        places = problem.model.own_places[i] + np.arange(own.size)
-        unseen = np.isin(places, open_)
-        if law.likely is not None and unseen.any():
-            own[unseen] = law.likely(own, rng.random(len(law.params)))[unseen]
-            open_ = np.setdiff1d(open_, places)
-    point = space.encode(values)
-    for j, one in enumerate(space.coordinates):
-        if one.place in open_ and one.param is not None:
-            point[j] = rng.uniform(*one.param.start_limits)
-    return space.decode(point)
-
-
 def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
     """Return what is known now; of a single test what its result says."""
     out, fit = gain.expected(known, []), tests[0].fit
@@ -430,30 +280,17 @@ def _advised(outcomes: Sequence[Outcome], safe: Sequence[int], now: float) -> in
     return min((i for i in near if outcomes[i].narrowness <= least + WIDER), key=effort)
 
 
-def _pair(
-    known: Known, outcomes: Sequence[Outcome], seen: Sequence[Seen], safe: Sequence[int]
-) -> tuple[int, int] | None:
-    """Return the places of the two safe tests that determine most together."""
-    first = sorted(safe, key=lambda i: -outcomes[i].number)[:PAIRED]
-
-    def number(pair: tuple[int, int]) -> float:
-        found = gain.expected(known, [seen[i] for i in pair])
-        return sum(one.probability for one in found.values())
-
-    return max(combinations(first, 2), key=number, default=None)
-
-
 def _beyond(known: Known, left: Sequence[str], rig: Rig, *, impacts: bool) -> dict[str, str]:
     """Return, for parameters that no test of the rig determines, what other rig would."""
     problem, out = known.problem, dict.fromkeys(left, "")
     test, springs = problem.measurement, len(problem.model.kinds)
-    fewer = {n: getattr(known, n)[: DRAWS // 4] for n in ("draws", "bread", "meat")}
-    few = replace(known, **fewer)
+    few: dict[str, Any] = {n: getattr(known, n) for n in ("draws", "bread", "meat", "reached")}
+    some = replace(known, **{n: each[: len(known.draws) // 4] for n, each in few.items()})
     for what, other in beyond(rig, springs) if left else ():
         made = [one for one in candidates(other, test, springs) if not one.repeat]
         made = [one for one in made if impacts or one.drive != "impact"]
         for one in made[:: max(len(made) // 12, 1)]:
-            found = gain.expected(few, [gain.look(few, one, other)])
+            found = gain.expected(some, [gain.look(some, one, other)])
             new = [name for name in left if found[name].state == "determined" and not out[name]]
             out |= dict.fromkeys(new, what)
     return out

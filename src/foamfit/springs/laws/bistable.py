@@ -221,6 +221,24 @@ def _likely(values: Array, marks: Array) -> Array:
     return np.array([k0, kc, -drop * sigma_a, eps_a, eps_c, kh_plus, kh_minus, values[7]])
 
 
+def _fewer(values: Array, top: float) -> Iterator[Array]:
+    """Yield a spring that stays on branches a and d up to a stress, and one that stays on a.
+
+    Both have the same strain at this stress as the spring of `values`.
+    """
+    k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus, eta = values
+    sigma_a = _sigma_a(k0, eps_a)
+    sigma_c, far = sigma_a + dsigma, 0.9 * LAST_STRAIN
+    on_c = eps_c - sigma_c / (kc + sigma_c) + top / (kc + top)
+    strain = min(eps_a + (top - sigma_a) / max(kh_plus, 1e-3 * k0), on_c)
+    if eps_a < strain < far:
+        slope = (top - sigma_a) / (strain - eps_a)
+        yield np.array([k0, max(kc, k0), 0.0, eps_a, far, slope, kh_minus, eta])
+        k0 = top * (1.0 - strain) / strain
+        eps_a = 1.5 * top / (k0 + 1.5 * top)
+        yield np.array([k0, max(kc, k0), 0.0, eps_a, 0.5 * (1.0 + eps_a), kh_plus, kh_minus, eta])
+
+
 def _to_stresses(values: Array, height: float) -> Array:
     """Return k0, kc, k_h±, each per height (Pa/m), σ_a, σ̄_c, elongation from a to C2 (m)."""
     k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus = values
@@ -292,6 +310,7 @@ LAW = Law(
     strata="eps_a",
     neighbours=_neighbours,
     likely=_likely,
+    fewer=_fewer,
     exchanged=(_to_stresses, _from_stresses),
     points=(
         PointOf("sigma_a", ("σ", "a"), "stress at A1, where snapping starts", "Pa"),

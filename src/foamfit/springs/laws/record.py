@@ -171,6 +171,8 @@ class Law:
     #: likely(values, marks): parameters of a foam like those published, about the known ones in
     #: `values`, for branches that no test has reached; marks (n_params,) are in [0, 1]
     likely: Callable[[Array, Array], Array] | None = None
+    #: fewer(values, largest stress): parameters of springs that stay on their first branches
+    fewer: Callable[[Array, float], Iterator[Array]] = _no_neighbours
     marks: int = 5  #: number of marks
     ways: int = 1  #: number of ways to read a loop
     #: stress of the first snap as a function of the parameters, by which interchangeable springs

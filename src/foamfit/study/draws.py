@@ -1,0 +1,282 @@
+"""What the tests at hand leave open: drawn foams that would have given the same records.
+
+Springs in series may have exchanged branches, and a spring may have stayed on its first branches:
+each such explanation of the records is a minimum of the cost. Foams are drawn about all of them,
+each weighted by Laplace's approximation of its probability (MacKay 2003, Information Theory,
+Inference, and Learning Algorithms, ch. 28), which prefers the explanation with fewer branches.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from foamfit.api import FitResult
+from foamfit.arrays import Array, Mask
+from foamfit.errors import SimulationError
+from foamfit.fitting.box import Space
+from foamfit.fitting.branches import unreached
+from foamfit.fitting.links import Links
+from foamfit.fitting.minima import in_order, joint_minima
+from foamfit.fitting.problem import Problem
+from foamfit.fitting.search import has_several
+from foamfit.fitting.together import Layout, Together, fit_linked
+from foamfit.springs.parameters import NUISANCE
+from foamfit.study import gain
+from foamfit.study.gain import Known
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.covariance import NOTHING
+from foamfit.trust.ranges import ALIKE, tolerance
+
+TRIES = 60  # attempts per draw
+FROM = 3  # number of minima from which springs with fewer branches are sought
+
+
+@dataclass(frozen=True, eq=False)
+class Test:
+    """A test at hand: its problem and parameters, its result if it was measured, and its study."""
+
+    problem: Problem
+    values: Array
+    fit: FitResult | None = None
+    study: str = ""  # name of the joint fit that it belongs to
+
+    def with_springs(self, drawn: Array) -> Array:
+        """Return its parameters with drawn springs."""
+        count = len(self.problem.model.names)
+        return np.append(drawn[:count], self.values[count:])
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Parameters of the tests at hand that explain them; the rest is as in `Known`."""
+
+    vectors: tuple[Array, ...]  # of each test
+    bread: Array  # (k, k)
+    meat: Array  # (k, k)
+    reached: Mask  # (k,)
+
+
+def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Known:
+    """Return what some tests of one foam say about the parameters of its springs."""
+    first = tests[0].problem
+    names = tuple(name for name in first.free() if name not in NUISANCE)
+    k, sizes = len(names), first.sizes(names, tests[0].values)
+    missed, share, roots = _of_fits(tests, names)
+
+    def said(t: int, values: Array) -> tuple[Array, Array]:
+        rows = gain.rows_of(tests[t].problem, values, names, sizes)
+        return gain.information(gain.without_nuisance(rows, k), roots[t])
+
+    def explained(vectors: Sequence[Array], reached: Mask | None = None) -> Explanation:
+        found = [said(t, values) for t, values in enumerate(vectors)]
+        bread, meat = (np.sum(each, axis=0) for each in zip(*found, strict=True))
+        reached = _reached(tests, vectors, names) if reached is None else reached
+        return Explanation(tuple(vectors), bread, meat, reached)
+
+    own = [one.values for one in tests]
+    values = _mean_of(tests, names, sizes, np.array([said(t, x)[0] for t, x in enumerate(own)]))
+    best = explained(own)
+    known = Known(
+        first, values, names, sizes, best.bread[None], best.meat[None], missed, share, np.ones(k),
+        best.reached[None], values[None],
+    )  # fmt: skip
+    known = replace(known, stretch=_stretch(known, tests))
+    if not draws:
+        return known
+    every = list[Explanation]()
+    if has_several(first.model) and any(one.fit for one in tests):
+        for found in _explanations(tests, names):
+            with suppress(SimulationError):  # it was found with less accuracy
+                every.append(explained(found.values))
+    several, mean = bool(every), tuple(one.with_springs(values) for one in tests)
+    every = every or [replace(best, vectors=mean)]
+    drawn, weights = _draws(known, tests, every, rng, draws)
+    for i, one in enumerate(drawn):
+        with suppress(SimulationError):  # a coarser simulation had followed the test
+            vectors = [test.with_springs(one.vectors[0]) for test in tests]
+            drawn[i] = explained(vectors, None if several else one.reached)
+    kept: dict[str, Any] = {"draws": np.array([one.vectors[0] for one in drawn])}
+    for name in ("bread", "meat", "reached"):
+        kept[name] = np.array([getattr(one, name) for one in drawn])
+    if several:
+        springs = [one.vectors[0][: len(first.model.names)] for one in every]
+        kept["explained"] = np.array(springs)[np.argsort(-weights)]
+    return replace(known, **kept)
+
+
+def _reached(tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[str]) -> Mask:
+    """Return whether a test has reached the branch of each parameter, (k,)."""
+    out = np.zeros(len(names), dtype=bool)
+    for one, values in zip(tests, vectors, strict=True):
+        never = unreached(one.problem, one.problem.objective.simulate(values, everything=True))
+        out |= np.array([name not in never for name in names])
+    return out
+
+
+def _explanations(tests: Sequence[Test], names: Sequence[str]) -> list[Together]:
+    """Return springs in series that explain the tests at hand.
+
+    They are the minima that noise could make the best, best first, and the best springs of which
+    one or more stay on their first branches (`Law.fewer`). These follow the tests about as well
+    with fewer parameters, but no search finds them, as more branches also follow the noise.
+    """
+    problems, model = tuple(one.problem for one in tests), tests[0].problem.model
+    links, top = Links(dict.fromkeys(names, "shared")), max(one.scales.stress for one in problems)
+    layout = Layout.of(problems, links)
+    minima = joint_minima(layout.fitted(layout.start([one.values for one in tests])))
+    simpler = dict[tuple[int, ...], Together]()
+    for found in minima[:FROM]:
+        own = [model.own(i, found.values[0]) for i in range(len(model.laws))]
+        each = [[x, *law.fewer(x, top)] for x, law in zip(own, model.laws, strict=True)]
+        for kind in list(product(*(range(len(levels)) for levels in each)))[1:]:
+            vectors = [values.copy() for values in found.values]
+            for values, (i, level) in product(vectors, enumerate(kind)):
+                model.own(i, values)[:] = each[i][level]
+            with suppress(SimulationError):
+                other = fit_linked(_held(tests, vectors, names), links, [vectors])
+                if kind not in simpler or other.cost < simpler[kind].cost:
+                    simpler[kind] = other
+    return [*minima, *simpler.values()]
+
+
+def _held(tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[str]) -> list[Problem]:
+    """Return the problems of some tests in which parameters of unreached branches are held."""
+    seen, out = _reached(tests, vectors, names), list[Problem]()
+    for problem, values in zip((one.problem for one in tests), vectors, strict=True):
+        for name in np.array(names)[~seen].tolist():
+            problem = problem.holding(name, float(values[problem.index[name]]))
+        out.append(problem)
+    return out
+
+
+def _of_fits(tests: Sequence[Test], names: Sequence[str]) -> tuple[float, dict[str, float], Array]:
+    """Return `missed` and `share` of `Known`, and what `information` needs of each fit.
+
+    A simulated test has neither noise nor model error.
+    """
+    missed, share, roots = 0.0, dict[str, list[float]](), np.ones((len(tests), len(names)))
+    for t, one in enumerate(tests):
+        best, objective = BestPoint(one.problem, one.values), one.problem.objective
+        if one.fit is None:
+            continue
+        missed += tolerance(best) / (ALIKE**2 - 1.0)
+        for curve, error in zip(objective.counted, best.errors, strict=True):
+            share.setdefault(curve, []).append(error.law / max(objective.span(curve), 1e-300))
+        for name, found in zip(best.names, best.spread.inflation.tolist(), strict=True):
+            if name in names and math.isfinite(found):
+                roots[t, names.index(name)] = math.sqrt(found)
+    return missed, {curve: float(np.mean(each)) for curve, each in share.items()}, roots
+
+
+def _mean_of(tests: Sequence[Test], names: Sequence[str], sizes: Array, breads: Array) -> Array:
+    """Return the mean parameters of the tests, weighted by the information in each."""
+    first = tests[0].problem
+    values, places = tests[0].values, [first.index[name] for name in names]
+    if len(tests) == 1:
+        return values
+    pull = [b @ (one.values[places] / sizes) for b, one in zip(breads, tests, strict=True)]
+    values = values.copy()
+    values[places] = sizes * (np.linalg.pinv(breads.sum(axis=0), rcond=1e-10) @ sum(pull))
+    return first.space().decode(first.space().encode(values))
+
+
+def _stretch(known: Known, tests: Sequence[Test]) -> Array:
+    """Return the widest range of each parameter in the fits over that to first order, (k,)."""
+    law = np.sqrt(np.maximum(np.diagonal(gain.covariance(known, [])[1][0]), 0.0))
+    out = np.ones(law.size)
+    for fit in (one.fit for one in tests if one.fit is not None):
+        for i, name in enumerate(known.names):
+            if (found := fit.parameters[name].range) is not None and law[i] > 0.0:
+                half = 0.5 * (found[1] - found[0]) / known.sizes[i]
+                out[i] = max(out[i], half / law[i])
+    return out
+
+
+def _draws(
+    known: Known,
+    tests: Sequence[Test],
+    every: Sequence[Explanation],
+    rng: np.random.Generator,
+    count: int,
+) -> tuple[list[Explanation], Array]:
+    """Return parameters that follow the tests about as well as the best point.
+
+    Parameters whose branch was reached are drawn from their covariance, including model error, and
+    the others from what the law calls likely, or from the limits of the search; a published set is
+    known but for the former. A draw that raises the cost by more than noise and model error allow
+    is drawn again, nearer to what explains the tests. Also returns the weights of the explanations.
+    """
+    problem, k = known.problem, len(known.names)
+    space, at = problem.space(), np.array([problem.index[name] for name in known.names])
+    measured = any(one.fit is not None for one in tests)
+    allowed, prior = (ALIKE**2 - 1.0) * known.missed, np.eye(k) / NOTHING**2
+    thin, n_springs = [one.problem.thinned().objective for one in tests], len(problem.model.names)
+
+    def cost(one: Explanation, values: Array) -> float:
+        springs, pairs = values[:n_springs], zip(thin, one.vectors, strict=True)
+        own = [(objective, np.append(springs, x[n_springs:])) for objective, x in pairs]
+        return sum(float(np.sum(objective.residual(x) ** 2)) for objective, x in own)
+
+    noise = float(np.max(np.diag(known.meat[0]) / np.maximum(np.diag(known.bread[0]), 1e-300)))
+    noise, marks, steps = max(noise, 1.0), list[float](), list[tuple[Array, Array]]()
+    for one in every:
+        inverse = np.linalg.inv(one.bread + prior)
+        spread = inverse @ (one.meat + prior) @ inverse + allowed / 1.96**2 * inverse
+        power, axes = np.linalg.eigh(spread)
+        axes = np.where(one.reached[:, None], axes * np.sqrt(np.maximum(power, 0.0)), 0.0)
+        best = space.encode(one.vectors[0])  # steps are taken in the coordinates of the search
+        slopes = space.slopes(best, one.vectors[0])[at] / known.sizes[:, None]
+        steps.append((best, np.linalg.lstsq(slopes, axes, rcond=1e-12)[0]))
+        volume = np.linalg.slogdet(np.eye(best.size) + slopes.T @ one.bread @ slopes)[1]
+        marks.append(-0.5 * (cost(one, one.vectors[0]) / noise + volume))
+    least = min(cost(one, one.vectors[0]) for one in every)
+    most = least + allowed + noise * float(stats.chi2.ppf(0.99, k))
+    weights, out = _weights(every, np.array(marks)), list[Explanation]()
+    for _ in range(count):
+        chosen = int(rng.choice(len(every), p=weights)) if len(every) > 1 else 0
+        one, (best, axes) = every[chosen], steps[chosen]
+        found, open_ = one.vectors[0], at[~one.reached & measured]
+        for step in 0.95 ** np.arange(TRIES):
+            point = np.clip(best + step * axes @ rng.normal(size=k), *space.box)
+            values = _with_open(problem, space, space.decode(point), open_, rng)
+            values[n_springs:] = found[n_springs:]
+            if cost(one, values) <= most:
+                found = in_order(space, problem.objective, values) if len(every) > 1 else values
+                break
+        out.append(replace(one, vectors=(found, *one.vectors[1:])))
+    return out, weights
+
+
+def _weights(every: Sequence[Explanation], marks: Array) -> Array:
+    """Return the probabilities of explanations; those that reach the same branches overlap."""
+    kinds, weights = [one.reached.tobytes() for one in every], np.exp(marks - marks.max())
+    for kind in set(kinds):
+        same = np.array([other == kind for other in kinds])
+        weights[same] *= weights[same].max() / max(weights[same].sum(), 1e-300)
+    return np.asarray(weights / weights.sum())
+
+
+def _with_open(
+    problem: Problem, space: Space, values: Array, open_: Array, rng: np.random.Generator
+) -> Array:
+    """Return parameters within their limits, with random ones at the places `open_`."""
+    for i, law in enumerate(problem.model.laws):
+        own = problem.model.own(i, values)
+        places = problem.model.own_places[i] + np.arange(own.size)
+        unseen = np.isin(places, open_)
+        if law.likely is not None and unseen.any():
+            own[unseen] = law.likely(own, rng.random(len(law.params)))[unseen]
+            open_ = np.setdiff1d(open_, places)
+    point = space.encode(values)
+    for j, one in enumerate(space.coordinates):
+        if one.place in open_ and one.param is not None:
+            point[j] = rng.uniform(*one.param.start_limits)
+    return space.decode(point)
