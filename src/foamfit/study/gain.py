@@ -265,7 +265,7 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
     One that may vanish is weak in the draws in which its interval or range would contain zero.
     """
     noise, law = (np.diagonal(one, axis1=1, axis2=2) for one in covariance(known, seen))
-    halves, ranges = NORMAL * np.sqrt(noise), np.sqrt(np.maximum(law, 0.0))
+    halves, ranges = (np.sqrt(np.maximum(one, 0.0)) for one in (NORMAL**2 * noise, law))
     wider, places = np.maximum(halves, ranges), [known.problem.index[n] for n in known.names]
     values, wide = known.draws[:, places] / known.sizes, wider / known.drawn_sizes
     clear, limits = np.abs(values) > wider, [known.problem.params[n] for n in known.names]
