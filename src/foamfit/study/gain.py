@@ -301,22 +301,25 @@ def _with_others(
     """Return the ends of intervals, and whether values far outside fit almost as well, (d, k).
 
     The rule is that of a joint fit (`joint_fit`); intervals extend to other springs that noise
-    could make the best.
+    could make the best. Of several tests, the one that these follow least counts.
     """
     low, high, elsewhere = values - halves, values + halves, np.zeros(values.shape, dtype=bool)
-    for one in seen:
-        for i, refits in enumerate(one.others):
-            noise = np.trace(known.meat[i] + one.meat[i]) / np.trace(known.bread[i] + one.bread[i])
-            near = [(x, x.rise / (NORMAL**2 * noise)) for x in refits]
-            for other, rise in near:
-                if rise < 1.0:
-                    half = np.where(other.reached, halves[i] * math.sqrt(1.0 - rise), UNKNOWN)
-                    low[i] = np.minimum(low[i], other.values - half)
-                    high[i] = np.maximum(high[i], other.values + half)
-            for other, rise in near:
-                if rise <= HARDLY_WORSE**2:
-                    apart = np.maximum(low[i] - other.values, other.values - high[i])
-                    elsewhere[i] |= apart > FAR * (high[i] - low[i])
+    shown = [one for one in seen if one.others]
+    for i in range(len(values)) if shown else ():
+        meat = known.meat[i] + sum(one.meat[i] for one in shown)
+        noise = np.trace(meat) / np.trace(known.bread[i] + sum(one.bread[i] for one in shown))
+        followed = zip(*(one.others[i] for one in shown if one.others[i]), strict=True)
+        worst = [max(each, key=lambda x: x.rise) for each in followed]
+        near = [(x, x.rise / (NORMAL**2 * noise)) for x in worst]
+        for other, rise in near:
+            if rise < 1.0:
+                half = np.where(other.reached, halves[i] * math.sqrt(1.0 - rise), UNKNOWN)
+                low[i] = np.minimum(low[i], other.values - half)
+                high[i] = np.maximum(high[i], other.values + half)
+        for other, rise in near:
+            if rise <= HARDLY_WORSE**2:
+                apart = np.maximum(low[i] - other.values, other.values - high[i])
+                elsewhere[i] |= apart > FAR * (high[i] - low[i])
     return low, high, elsewhere
 
 

@@ -8,6 +8,7 @@ those in every other candidate.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -157,7 +158,9 @@ def with_others(
         if each and not broken:
             residual = problem.objective.residual(known.with_springs(drawn, problem))
             for one in each:
-                with suppress(SimulationError):
+                try:
                     found.append(one.and_in(known, problem, residual, weight).refit(known))
+                except SimulationError:  # which these springs would not follow
+                    found.append(one.refit(known)._replace(rise=math.inf))
         out.append(tuple(found))
     return replace(seen, others=tuple(out))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ NEARLY = 0.1  # tests that determine this many parameters fewer, on average, cou
 # What a softer test may lose: parameters, on average, and this share of the width of intervals. A
 # faster one is also more likely to break the rig: with 0.1, fewer parameters were determined.
 FEWER, WIDER = 0.5, 0.05
+PAIRED = 20  # number of tests whose pairs are compared
 TOLD_APART = 9.0  # rise of χ² at which a test tells two laws apart
 # The closing velocity is sought at SPEEDS down to a SLOWEST part of the largest; then its interval
 # is halved.
@@ -103,12 +105,13 @@ def plan(
     now = _now(known, tests)
     contradicted = known.missed > 0.0 and any(x.fit and x.fit.contradictions for x in tests)
 
-    def outcome(one: Candidate, shown: Seen) -> Outcome:
-        error = None if target is None else target.error(known, [shown])
-        found = gain.no_worse(gain.expected(known, [shown]), now)
+    def outcome(one: Candidate, *more: Seen) -> Outcome:
+        risk = np.any([each.broken for each in more], axis=0)
+        error = None if target is None else target.error(known, more)
+        found = gain.no_worse(gain.expected(known, more), now)
         if contradicted and one.drive == "impact":  # as in a fit, where the law errs as well
             found = {name: x.capped() for name, x in found.items()}
-        return Outcome(one, float(np.mean(shown.broken)), found, shown.force, error, shown.apart)
+        return Outcome(one, float(np.mean(risk)), found, more[0].force, error, more[0].apart)
 
     def judged(seen: Sequence[Seen]) -> tuple[list[Outcome], list[int], int | None]:
         outcomes = list(map(outcome, asked, seen))
@@ -121,8 +124,10 @@ def plan(
     if best is not None and known.explained is not None:
         progress(0.7, "other springs that would show the same")
         each = others_of(known, tests, asked[best], limits)
-        pairs = zip(asked, seen, strict=True)
-        outcomes, safe, best = judged([with_others(known, each, *x, limits) for x in pairs])
+        each_test = zip(asked, seen, strict=True)
+        seen = [with_others(known, each, *x, limits) for x in each_test]
+        outcomes, safe, best = judged(seen)
+    pair = _pair(known, outcomes, seen, safe)
     progress(0.92, "what no test of this rig determines")
     shown = [now, *(outcomes[i].expected for i in safe)]
     sure = {name for each in shown for name, one in each.items() if one.state == "determined"}
@@ -138,6 +143,7 @@ def plan(
         now=now,
         outcomes=tuple(outcomes),
         advice=None if best is None else outcomes[best],
+        pair=pair and (outcome(asked[pair[0]], *(seen[i] for i in pair)), asked[pair[1]]),
         never=never,
         closing={mass: _closing(known, mass, limits) for mass in limits.masses},
         quantity=None
@@ -278,6 +284,19 @@ def _advised(outcomes: Sequence[Outcome], safe: Sequence[int], now: float) -> in
     near = [i for i in safe if outcomes[i].number >= most - FEWER and least_apart(i) >= TOLD_APART]
     least = min(outcomes[i].narrowness for i in near)
     return min((i for i in near if outcomes[i].narrowness <= least + WIDER), key=effort)
+
+
+def _pair(
+    known: Known, outcomes: Sequence[Outcome], seen: Sequence[Seen], safe: Sequence[int]
+) -> tuple[int, int] | None:
+    """Return the places of the two safe tests that determine most together."""
+    first = sorted(safe, key=lambda i: -outcomes[i].number)[:PAIRED]
+
+    def number(pair: tuple[int, int]) -> float:
+        found = gain.expected(known, [seen[i] for i in pair])
+        return sum(one.probability for one in found.values())
+
+    return max(combinations(first, 2), key=number, default=None)
 
 
 def _beyond(known: Known, left: Sequence[str], rig: Rig, *, impacts: bool) -> dict[str, str]:

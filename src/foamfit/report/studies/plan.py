@@ -119,6 +119,8 @@ class Plan(Result, OfLaw):
     now: dict[str, Expected]  #: what is known now
     outcomes: tuple[Outcome, ...]
     advice: Outcome | None  #: that of the advised test; None if none is safe
+    #: the pair of tests that determines most, with what both determine
+    pair: tuple[Outcome, Candidate] | None
     never: dict[str, str]  #: parameters that no single test determines, and what would
     #: by striker mass: velocities that reach every branch in half, and in 95 % of the draws
     closing: dict[float, tuple[float, float]]
@@ -183,6 +185,7 @@ class Plan(Result, OfLaw):
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``plan.json``: SI, plain types, None for missing values."""
         best = self.advice
+        pair = self.pair and [_asked(self.pair[0].candidate), _asked(self.pair[1])]
         content: dict[str, Any] = plain({
             **stamp(),
             "tests": [one.name for one in self.tests],
@@ -202,6 +205,7 @@ class Plan(Result, OfLaw):
                 }
                 for one in self.outcomes
             ],
+            "pair": pair and {"tests": pair, "determined": self.pair and self.pair[0].determined},
             "never_determined": self.never,
             "closing_velocity": [
                 {"mass": mass, "half": ends[0], "sure": ends[1]}
