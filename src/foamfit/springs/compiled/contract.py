@@ -53,6 +53,7 @@ from numba.core.imputils import lower_setattr_generic
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import infer_getattr, intrinsic, lower_getattr_generic, models, register_model
 
+from foamfit.springs.compiled.parts import PartCompiler
 from foamfit.springs.compiled.stale import drop_stale
 
 HELD, OWN, MEMORY = 6, 8, 48  # memory: on two held numbers, then what the law keeps
@@ -93,7 +94,9 @@ POINT = len(_LAST)
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy", "fastmath": {"contract"}, "no_rewrites": True,
 }  # fmt: skip
-_INSIDE: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_INSIDE: dict[str, Any] = {
+    **OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": PartCompiler,
+}  # fmt: skip
 # Without reference counts, which take longer than the loops.
 inner = njit(**_INSIDE, _nrt=False)
 inlined = njit(**_INSIDE, _nrt=False, forceinline=True)
