@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.solve import cache
 from foamfit.solve.compiled import along, loop, static
+from foamfit.solve.compiled.run import ENDED, OUTCOME, SWITCHES
 from foamfit.solve.layout import lay_out
 from foamfit.solve.scene import DONE, MOTION, NO_SWITCHES, STRESS
 from foamfit.springs.compiled import compiled
@@ -51,12 +52,12 @@ def stress_along(law: Law, row: Array, strain: Array) -> tuple[Array, NDArray[np
         along.follow(*given, NO_SWITCHES, samples)
         return out[0, 0], samples[:, 2].astype(np.int64)
     branches = np.zeros(strain.size, np.int64)
-    log, endings = np.empty((4 * strain.size + 64, 5)), np.empty(loop.ENDINGS)
-    loop.integrate(*given, log, endings)
-    for at, _, _, entered, _ in log[: int(endings[loop.SWITCHES])].tolist():
+    log, told = np.empty((4 * strain.size + 64, 5)), given[1]
+    loop.integrate(*given, log)
+    for at, _, _, entered, _ in log[: int(told[SWITCHES])].tolist():
         branches[int(np.searchsorted(given[7], at, "right")) :] = int(entered)
-    if endings[loop.OUTCOME] != DONE:
-        out[0, 0, int(np.searchsorted(given[7], endings[loop.ENDED])) :] = np.inf
+    if told[OUTCOME] != DONE:
+        out[0, 0, int(np.searchsorted(given[7], told[ENDED])) :] = np.inf
     return out[0, 0], branches
 
 
@@ -68,9 +69,8 @@ def strain_along(law: Law, row: Array, stress: Array) -> Array:
         history = np.empty((2, 1, stress.size))
         static.balance(*given, NO_SWITCHES, history)
         return np.asarray(history[0, 0])
-    endings = np.empty(loop.ENDINGS)
-    loop.integrate(*given, NO_SWITCHES, endings)
-    if endings[loop.OUTCOME] != DONE:
+    loop.integrate(*given, NO_SWITCHES)
+    if given[1][OUTCOME] != DONE:
         out[0, 1, :] = np.nan
     return np.asarray(out[0, 1])
 

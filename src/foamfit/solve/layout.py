@@ -201,7 +201,7 @@ def lay_out(
         "new": wide, "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
         "batch": run.BATCH * (6 + contract.BY + parameters) + 2 * p + 8 * contract.MOST_TERMS + 8,
         "aside": max(fades, relaxes, internal * (count * (1 + shape.terms) + groups + 1)),
-        "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0, "worst": 2,
+        "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0,
         "largest": p if size else 0, "kept": count * width + groups if size and p else 0,
         "systems": 2 * run.SYSTEMS * size * (3 * reach + 1),
         "right": 2 * run.SYSTEMS * size,

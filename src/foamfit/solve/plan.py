@@ -14,7 +14,7 @@ from foamfit.errors import InputError
 from foamfit.solve import cache, histories
 from foamfit.solve import scene as scenes
 from foamfit.solve.compiled import along, loop, rates, static
-from foamfit.solve.compiled.run import AT, POINTS
+from foamfit.solve.compiled.run import AT, ENDED, FINITE, NOW, OUTCOME, POINTS, SWITCHES, TOLD
 from foamfit.solve.layout import Layout, Memory, lay_out
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
 from foamfit.solve.scene import NO_SWITCHES, Slopes
@@ -73,9 +73,12 @@ def _laws(records: tuple[Law, ...]) -> Laws:
 
 
 @lru_cache(maxsize=64)
-def _of_explicit_impact(drag: float, speed: float, tol: float, most: int, followed: bool) -> Array:
-    """Return the numbers of explicit steps of an impact, see `loop`; they are only read."""
-    return np.array((drag, 1.0, speed, tol, most, 0.0, False, followed, 0.0, speed, 0.0, 0.0))
+def _numbers(
+    drag: float, speed: float, tol: float, most: int, brief: float, over: bool, followed: bool,
+    least: tuple[float, ...],
+) -> Array:  # fmt: skip
+    """Return the numbers that the loop over time is given, see `loop`; they are only read."""
+    return np.array((drag, 1.0, speed, tol, most, brief, over, followed, *least))
 
 
 class Plan(NamedTuple):
@@ -166,43 +169,36 @@ class Plan(NamedTuple):
         everything: bool, logged: int = LOGGED,
     ) -> Motion:  # fmt: skip
         """Integrate in time and log the switches, if there is room."""
-        stiff, damped = bool(self.implicit), bytes([eta > 0.0 for eta in rows[:, 0].tolist()])
-        if self.implicit is None and (drag or len(self.ends) > 1 or 1 in damped):
-            vibrates, relaxes = self.fastest_rates(rows, heights, drag)
-            stiff = vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION
-        shown = len(heights) if everything else 1
-        out = np.empty((1 + len(directions), 1 + shown, self.time.size))
-        if len(heights) >= LEAST_AGGREGATE and not (stiff or len(directions)):
+        damped = bytes([eta > 0.0 for eta in rows[:, 0].tolist()])
+        methods = self._methods(rows, heights, drag, damped)
+        count, p = len(heights), len(directions)
+        out = np.empty((1 + p, 1 + (count if everything else 1), self.time.size))
+        if count >= LEAST_AGGREGATE and methods[0] == p == 0:
             found = self._as_one(rows, heights, rtol, drag, out)
             if found is not None:
                 return found
-        log = np.empty((logged if everything else 0, 5))
-        endings = np.empty(loop.ENDINGS)
-        given = rows, heights, damped, directions, out, log, endings
-        methods = self._methods(stiff)
+        log = np.empty((logged, 5)) if everything else NO_SWITCHES
         for degree in methods:
             reals = self._reals(rows, heights, rtol, drag, degree, methods[-1] > degree)
-            self._integrate(*given, reals, degree)
-            outcome = endings.item(loop.OUTCOME)
-            if outcome not in _STIFF:
+            _, told = self._integrate(rows, heights, damped, directions, out, log, reals, degree)
+            if told.item(OUTCOME) not in _STIFF:
                 break
-        if outcome == scenes.STEP_UNDERFLOW:
+        if told.item(OUTCOME) == scenes.STEP_UNDERFLOW:
             fastest = max(self.fastest_rates(rows, heights, drag))
-            endings[loop.OUTCOME] = scenes.TOO_FAST if fastest > FASTEST else scenes.STEP_UNDERFLOW
-        lost = loop.lost(endings) if degree else 0.0
-        return self._motion(out, RADAU if degree else EXPLICIT_STEPS, endings, log, rows, lost)
+            told[OUTCOME] = scenes.TOO_FAST if fastest > FASTEST else scenes.STEP_UNDERFLOW
+        return self._motion(out, RADAU if degree else EXPLICIT_STEPS, told, log, rows)
 
-    def _methods(self, stiff: bool) -> tuple[int, ...]:
+    def _methods(self, rows: Array, heights: Array, drag: float, damped: bytes) -> tuple[int, ...]:
         """Return the degrees of the methods to try: 0 for explicit steps.
 
         Where explicit steps may take as many as all, implicit ones are not tried after them.
         """
-        if self.time.size == 1:
-            return (0,)
-        if self.implicit is not None:
-            return (POINTS,) if self.implicit else (0,)
-        if stiff:
-            return POINTS, 0
+        if self.implicit is not None or self.time.size == 1:
+            return (POINTS,) if self.implicit and self.time.size > 1 else (0,)
+        if drag or len(self.ends) > 1 or 1 in damped:
+            vibrates, relaxes = self.fastest_rates(rows, heights, drag)
+            if vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION:
+                return POINTS, 0
         return (0, POINTS) if self.max_explicit < self.max_steps else (0,)
 
     def _reals(
@@ -226,14 +222,12 @@ class Plan(NamedTuple):
             brief = SHORT * lasts * (tol / 3e-8) ** (1.0 / 6.0)
         elif self.implicit is None:
             most = self.max_explicit
-        if not degree and self.speed > 0.0:
-            return _of_explicit_impact(drag, self.speed, tol, most, followed)
         scales = self._scales(rows, heights)
-        return np.array((drag, 1.0, self.speed, tol, most, brief, over, followed, *scales))
+        return _numbers(drag, self.speed, tol, most, brief, over, followed, scales)
 
     def _integrate(
         self, rows: Array, heights: Array, damped: bytes, directions: Directions, out: Array,
-        log: Array, endings: Array, reals: Array, degree: int = 0,
+        log: Array, reals: Array, degree: int = 0,
     ) -> Memory:  # fmt: skip
         """Run the loop over time, with implicit steps if `degree` is that of their polynomial.
 
@@ -241,7 +235,7 @@ class Plan(NamedTuple):
         """
         memory = self._layout(rows, damped, directions, degree).memory()
         drive = self.mass, reals, self.values, self.time
-        cache.timed(loop.integrate, *memory, rows, heights, *drive, out, log, endings)
+        cache.timed(loop.integrate, *memory, rows, heights, *drive, out, log)
         return memory
 
     def _as_one(
@@ -260,25 +254,19 @@ class Plan(NamedTuple):
         one = self._replace(laws=Laws((law,), (made,)), ends=(1,), implicit=False)
         row, height = np.concatenate(([0.0], row))[None], heights.sum(keepdims=True)
         reals = one._reals(row, height, AS_ONE * rtol / count / self.margin, drag)
-        log, endings = np.empty((4 * count + 64, 5)), np.empty(loop.ENDINGS)
+        log = np.empty((4 * count + 64, 5))
         whole = out if out.shape[1] == 2 else np.empty((1, 2, self.time.size))
-        words, memory = one._integrate(
-            row, height, b"\0", NO_DIRECTIONS, whole, log, endings, reals
-        )
-        memory = memory[words[AT["row"]] :]
+        words, told = one._integrate(row, height, b"\0", NO_DIRECTIONS, whole, log, reals)
         out[0, 0], out[0, -1] = whole[0, 0], whole[0, 1]
-        if endings[loop.OUTCOME] == scenes.DONE:
-            end = endings.item(loop.ENDED)
+        if told[OUTCOME] == scenes.DONE:
+            memory, end = told[len(NOW) + words[AT["row"]] :], told.item(ENDED)
             log = aggregate.nodes_and_switches(memory, heights, log[:, 0], self.time, end, out)
-            endings[loop.SWITCHES] = len(log)
-            endings[loop.FINITE] = np.isfinite(out[0]).all()
-        return self._motion(out, AGGREGATE, endings, log, rows, 0.0)
+            told[SWITCHES], told[FINITE] = len(log), np.isfinite(out[0]).all()
+        return self._motion(out, AGGREGATE, told, log, rows)
 
-    def _motion(
-        self, out: Array, method: str, endings: Array, log: Array, rows: Array, lost: float
-    ) -> Motion:
+    def _motion(self, out: Array, method: str, told: Array, log: Array, rows: Array) -> Motion:
         """Return the result of a run as a Motion; raise SimulationError if it failed."""
-        outcome, time, steps, switches, finite, strongest, *_ = endings.tolist()
+        outcome, time, steps, switches, finite, strongest, *damped = told[:TOLD].tolist()
         if outcome != scenes.DONE or not finite:
             outcome = int(outcome) if outcome != scenes.DONE else scenes.NOT_FINITE
             loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
@@ -286,8 +274,7 @@ class Plan(NamedTuple):
         slopes = Slopes(out[1:, 1:], out[1:, 0]) if len(out) > 1 else None
         if len(log):
             log = log[: int(switches)] if switches <= len(log) else np.empty((int(switches), 5))
-        else:
-            log = NO_SWITCHES
+        lost = 0.0 if method != RADAU else loop.lost(strongest, *damped)
         motion = out[0, 1:], out[0, 0]
         return Motion(*motion, time, log, int(steps), method, slopes, lost, strongest)
 

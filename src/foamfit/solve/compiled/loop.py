@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-from foamfit.arrays import Array
 from foamfit.solve import scene
 from foamfit.solve.compiled import events, run
 from foamfit.solve.compiled.motion import dense, look, rates
@@ -22,12 +21,6 @@ FIRST = 40.0  # first implicit step over a short one
 FADES = 5.0  # longest explicit step over a relaxation time; steps are stable up to 6.3
 TRIED, BEYOND = 500, 4.0  # steps, and expected steps over their bound, that end a hopeless run
 STOPPED = 0.1  # most of the velocity that a first step takes
-# Results of a run.
-(
-    OUTCOME, ENDED, STEPS, SWITCHES, FINITE, STRONGEST, FARTHEST, DAMPED_OUT, MOTION_LOST,
-    STRESS_LOST,
-) = range(10)  # fmt: skip
-ENDINGS = 10
 LEAST_SHARE = 1e-6  # of the largest scale of nodes, see `_fresh_scales`
 SWITCHED, RELEASED, STALLED = 1, 2, 3  # what happened in a step
 
@@ -290,16 +283,16 @@ def _failure(c, how, most, gives_up):
 
 
 @outer
-def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log, endings):
-    """Integrate a chain over sample times; fill `endings`.
+def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log):
+    """Integrate a chain over sample times.
 
     `out` (1 + p, 1 + nodes, n) becomes base stress and displacements, and their derivatives, `log`
-    the switches; `ints` and `floats`, zeros, are the memory of the run.
+    the switches; `ints` and `floats`, zeros, are the memory of the run, which begins with its
+    results, see `run.NOW`.
     """
     c = run.begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals)
-    given, told = start(reals), start(endings)
-    r, want, struck = c.now, int(c.p > 0), int(given[SPEED] > 0.0)
-    tol, most, stalled, done = given[TOL], given[MOST], 0, 0
+    r, given, want = c.now, start(reals), int(c.p > 0)
+    struck, tol, most, stalled, done = int(given[SPEED] > 0.0), given[TOL], given[MOST], 0, 0
     _begin(c, given)
     if struck:
         _strike(c, want)
@@ -334,18 +327,17 @@ def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log, 
             done = run.call_drive(c, 0, want)
             _turn(c, want, -1 + c.none)
         r.step = dt
-    told[OUTCOME], told[ENDED] = outcome, ended
-    told[STEPS], told[SWITCHES], told[FINITE] = r.taken, r.logged, is_finite(c, c.shown)
-    told[STRONGEST], told[FARTHEST] = r.largest, c.scales[run.OF_W]
-    told[DAMPED_OUT] = r.damped
-    told[MOTION_LOST], told[STRESS_LOST] = c.worst[0], c.worst[1]
+    r.outcome, r.ended, r.finite = outcome, ended, is_finite(c, c.shown)
+    r.farthest = c.scales[run.OF_W]
 
 
-def lost(endings: Array) -> float:
-    """Return the size of the vibrations that implicit steps damped out, relative to the ranges."""
-    damped, moved = float(endings[DAMPED_OUT]), float(endings[FARTHEST])
-    motion, stress = endings[MOTION_LOST : STRESS_LOST + 1].tolist()
+def lost(strongest: float, moved: float, damped: float, motion: float, stress: float) -> float:
+    """Return the size of the vibrations that implicit steps damped out, relative to the ranges.
+
+    The arguments are results of a run: largest stress and displacement, vibrations damped out,
+    largest motion and stress of those that a sample lacks.
+    """
     if motion > 0.0:
         share = motion / moved if moved > 0.0 else 0.0
-        damped += max(share, stress / float(endings[STRONGEST]))
+        damped += max(share, stress / strongest)
     return damped

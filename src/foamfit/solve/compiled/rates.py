@@ -121,11 +121,11 @@ def remember(c, span, wait):
     vibrates with amplitude δv/ω. `alive` (groups, 2) sums δv/√ω over all steps, because a vibration
     whose stiffness changes slowly conserves energy over frequency, and keeps the decay rate of the
     slowest: in a row of masses the slowest unresolved vibration decays last, with the amplitude of
-    all of them together. `worst` (motion, stress) includes the vibration left after `wait`, at the
+    all of them together. What the response lacks includes the vibration left after `wait`, at the
     first sample that may show it.
     """
     motion = stress = 0.0
-    alive, worst = c.alive, c.worst
+    alive, r = c.alive, c.now
     row = math.sin(0.5 * math.pi / max(c.nodes, 2))
     for g in range(c.nodes):
         below, above = stiffness_of(c, g, False), stiffness_of(c, g + 1, False)
@@ -147,4 +147,4 @@ def remember(c, span, wait):
             motion += size
             stress = max(stress, max(below, above) * size)
             alive[2 * g] *= math.exp(-alive[2 * g + 1] * span)
-    worst[0], worst[1] = max(worst[0], motion), max(worst[1], stress)
+    r.motion_lost, r.stress_lost = max(r.motion_lost, motion), max(r.stress_lost, stress)

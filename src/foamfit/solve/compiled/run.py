@@ -29,21 +29,20 @@ from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import REAL, REALS_AT, WHOLE, address, inner, past, start
 from foamfit.springs.laws.record import DRAG, OWN_ETA, OWN_HEIGHT
 
-# Arrays of floats: blocks of `width` numbers of the springs (see `compiled.contract`); area over
-# mass of the nodes; the drive now; stress of each group; derivatives of height and eta of each
-# spring and of drag; of the held numbers of each spring; of the stress of each spring at fixed
-# strain, then of its T at fixed strain; of the stress of each group, then zeros and two rows to
-# work with; of the strains; scales of the kinds of components; numbers that change during a run;
+# Arrays of floats: numbers that change during a run; blocks of `width` numbers of the springs (see
+# `compiled.contract`); area over mass of the nodes; the drive now; stress of each group;
+# derivatives of height and eta of each spring and of drag; of the held numbers of each spring; of
+# the stress of each spring at fixed strain, then of its T at fixed strain; of the stress of each
+# group, then zeros and two rows to work with; of the strains; scales of the kinds of components;
 # rates at the stages of a step; its dense output; the state, that at the end of a step, and one
 # between with its rates; zeros; errors; samples that are computed together; what is set aside
 # during a ramp, see `internal`. Those of implicit steps: Jacobian, n rows of 2 reach + 1;
-# vibrations, see `implicit.remember`, and the largest motion and stress at a sample; values of the
-# derivatives over the scales; a copy of `springs` and `carried`; factored systems, complex, SYSTEMS
-# of n rows of 3 reach + 1, and their right sides.
+# vibrations, see `rates.remember`; values of the derivatives over the scales; a copy of `springs`
+# and `carried`; factored systems, complex, SYSTEMS of n rows of 3 reach + 1, and their right sides.
 FLOATS = (
-    "springs", "per_mass", "drive", "carried", "own", "held", "part", "common", "strain", "scales",
-    "now", "stage", "line", "y", "new", "state", "f", "nil", "errors", "batch", "aside",
-    "jacobian", "alive", "worst", "largest", "kept", "systems", "right",
+    "now", "springs", "per_mass", "drive", "carried", "own", "held", "part", "common", "strain",
+    "scales", "stage", "line", "y", "new", "state", "f", "nil", "errors", "batch", "aside",
+    "jacobian", "alive", "largest", "kept", "systems", "right",
 )  # fmt: skip
 # Arrays of integers: rows of NUMBERS of the springs; first spring of each group, and their number;
 # directions of the derivatives, (p, 2); where the directions of each spring begin and end, and
@@ -96,16 +95,20 @@ DRIVE = (
     "value", "value_rate", "top_speed", "flat", "dragged", "pace", "gravity", "overdamped",
     "beginning", "push", "spread", "shift", "shift_rate", "shifted",
 )  # fmt: skip
-# Numbers that change during a run: time since the piece began, time at which it begins, step,
-# length of the piece, steps, growth of the next step, largest stress, whether the base stress has
-# risen, last error, next sample, number of the piece, switches; of implicit steps: length of the
-# one before, least length that the error can enforce, length of a short step, short steps in a row,
-# size of all vibrations that were damped out, and of those in the last steps; steps without an
-# attempt of `series`; share of the step that the values belong to.
+# Numbers that change during a run. First those that it returns: outcome, time of its end, steps,
+# switches, whether all samples are finite, largest stress and displacement; of implicit steps, size
+# of all vibrations that were damped out, and largest motion and stress of those that a sample
+# lacks. Then time since the piece began, time at which it begins, step, length of the piece, growth
+# of the next step, whether the base stress has risen, last error, next sample, number of the piece;
+# of implicit steps: length of the one before, least length that the error can enforce, length of a
+# short step, short steps in a row, size of the vibrations damped out in the last steps; steps
+# without an attempt of `series`; share of the step that the values belong to.
 NOW = (
-    "now", "begun", "step", "horizon", "taken", "grow", "largest", "pressed", "last", "sample",
-    "piece", "logged", "before", "floor", "brief", "in_row", "damped", "damping", "paused", "seen",
+    "outcome", "ended", "taken", "logged", "finite", "largest", "farthest", "damped",
+    "motion_lost", "stress_lost", "now", "begun", "step", "horizon", "grow", "pressed", "last",
+    "sample", "piece", "before", "floor", "brief", "in_row", "damping", "paused", "seen",
 )  # fmt: skip
+OUTCOME, ENDED, SWITCHES, FINITE, TOLD = 0, 1, 3, 4, 10
 BATCH = 64  # samples that are computed together
 # Rows of the stages; the row with the rates at the end of a step; rows of the dense output.
 STAGES, STEPPED, LINE = 16, 12, 7
