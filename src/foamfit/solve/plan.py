@@ -49,7 +49,7 @@ SHORT = 5e-4
 LEAST_TOL, LEAST_OF_MASSES, LEAST_VIBRATING = 2e-14, 5e-13, 5e-12  # the last of implicit steps
 # Outcomes of explicit steps after which implicit ones are tried.
 _STIFF = scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW
-LOGGED = 1024  # switches in the log of a first run; with more it is repeated
+LOGGED = 64
 AT_MOST = 1e-9  # error of an elongation over the height, or over the largest elongation
 
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
@@ -103,6 +103,7 @@ class Plan(NamedTuple):
     margin: float  #: error of a step over the requested error
     max_steps: int
     max_explicit: int  #: explicit steps before implicit ones are tried
+    damped: bool  #: whether a spring may have a dashpot
     least: float = LEAST_VIBRATING  #: least error of an implicit step of undamped springs
     implicit: bool | None = None  #: whether steps are implicit; None: only in stiff scenes
 
@@ -127,11 +128,7 @@ class Plan(NamedTuple):
             if found is not None:
                 return found
         drag = self.drag if drag is None else drag
-        given = rows, heights, rtol, drag, directions, everything
-        motion = self._integrated(*given)
-        if everything and len(motion.switches) > LOGGED and motion.method != AGGREGATE:
-            motion = self._integrated(*given, len(motion.switches))
-        return motion
+        return self._integrated(rows, heights, rtol, drag, directions, everything)
 
     # ------------------------------------------------------------------ arrays of the solver
 
@@ -152,9 +149,7 @@ class Plan(NamedTuple):
         return slopes_of(self.laws.made, rows[:, 1 + 2 * self.terms :])
 
     def _scales(self, rows: Array, heights: Array) -> tuple[float, float, float, float]:
-        """Return least scales of displacement, velocity, strain and stress."""
-        if self.speed > 0.0:
-            return 0.0, self.speed, 0.0, 0.0
+        """Return least scales of displacement, velocity, strain and stress under a drive."""
         first, total = self._slopes(rows)[0].min(), heights.sum()
         most = float(np.abs(self.values).max())
         if self.top == scenes.MOTION:
@@ -168,10 +163,10 @@ class Plan(NamedTuple):
         self, rows: Array, heights: Array, rtol: float, drag: float, directions: Directions,
         everything: bool, logged: int = LOGGED,
     ) -> Motion:  # fmt: skip
-        """Integrate in time and log the switches, if there is room."""
-        damped = bytes([eta > 0.0 for eta in rows[:, 0].tolist()])
-        methods = self._methods(rows, heights, drag, damped)
+        """Integrate in time and log the switches, again if there are more than `logged`."""
         count, p = len(heights), len(directions)
+        damped = (rows[:, 0] > 0.0).tobytes() if self.damped else bytes(count)
+        methods = self._methods(rows, heights, drag, damped)
         out = np.empty((1 + p, 1 + (count if everything else 1), self.time.size))
         if count >= LEAST_AGGREGATE and methods[0] == p == 0:
             found = self._as_one(rows, heights, rtol, drag, out)
@@ -181,11 +176,15 @@ class Plan(NamedTuple):
         for degree in methods:
             reals = self._reals(rows, heights, rtol, drag, degree, methods[-1] > degree)
             _, told = self._integrate(rows, heights, damped, directions, out, log, reals, degree)
-            if told.item(OUTCOME) not in _STIFF:
+            outcome = told.item(OUTCOME)
+            if outcome not in _STIFF:
                 break
-        if told.item(OUTCOME) == scenes.STEP_UNDERFLOW:
+        if outcome == scenes.STEP_UNDERFLOW:
             fastest = max(self.fastest_rates(rows, heights, drag))
             told[OUTCOME] = scenes.TOO_FAST if fastest > FASTEST else scenes.STEP_UNDERFLOW
+        if outcome == scenes.DONE and everything and told.item(SWITCHES) > logged:
+            more = int(told.item(SWITCHES))
+            return self._integrated(rows, heights, rtol, drag, directions, everything, more)
         return self._motion(out, RADAU if degree else EXPLICIT_STEPS, told, log, rows)
 
     def _methods(self, rows: Array, heights: Array, drag: float, damped: bytes) -> tuple[int, ...]:
@@ -222,8 +221,9 @@ class Plan(NamedTuple):
             brief = SHORT * lasts * (tol / 3e-8) ** (1.0 / 6.0)
         elif self.implicit is None:
             most = self.max_explicit
-        scales = self._scales(rows, heights)
-        return _numbers(drag, self.speed, tol, most, brief, over, followed, scales)
+        speed = self.speed
+        least_scales = (0.0, speed, 0.0, 0.0) if speed > 0.0 else self._scales(rows, heights)
+        return _numbers(drag, speed, tol, most, brief, over, followed, least_scales)
 
     def _integrate(
         self, rows: Array, heights: Array, damped: bytes, directions: Directions, out: Array,
@@ -272,11 +272,11 @@ class Plan(NamedTuple):
             loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
             raise scenes.failure(outcome, self.top, self.values, loose, steps=int(steps), time=time)
         slopes = Slopes(out[1:, 1:], out[1:, 0]) if len(out) > 1 else None
-        if len(log):
-            log = log[: int(switches)] if switches <= len(log) else np.empty((int(switches), 5))
-        lost = 0.0 if method != RADAU else loop.lost(strongest, *damped)
-        motion = out[0, 1:], out[0, 0]
-        return Motion(*motion, time, log, int(steps), method, slopes, lost, strongest)
+        log, lost = log[: int(switches)], loop.lost(strongest, *damped) if method == RADAU else 0.0
+        first = out[0]
+        return Motion(
+            first[1:], first[0], time, log, int(steps), method, slopes, lost, strongest
+        )  # fmt: skip
 
     # ------------------------------------------------------------------ without integration
 
@@ -338,8 +338,8 @@ def _time(t: ArrayLike) -> Array:
     time = as_samples(t, "t")  # a writable copy, for which the loops are compiled
     if time.ndim != 1 or time.size == 0:
         raise InputError("t must be a one-dimensional array with at least one sample")
-    ends = math.isfinite(time.item(0)) and math.isfinite(time.item(-1))
-    if not ends or np.count_nonzero(time[1:] > time[:-1]) < time.size - 1:
+    lasts = time.item(-1) - time.item(0)
+    if not lasts < math.inf or 0 in (time[1:] > time[:-1]).tobytes():
         wrong = ~np.isfinite(time)
         wrong[1:] |= ~(time[1:] > time[:-1])
         at = int(wrong.argmax())
@@ -403,5 +403,5 @@ def plan(
     drag, terms = chain.site_damping / chain.height, max(chain.relaxation)
     return Plan(
         solver, laws, terms, chain.height, arrays.ends, masses, drag, top, values, time, speed,
-        margin, most, explicit,
+        margin, most, explicit, damped,
     )  # fmt: skip

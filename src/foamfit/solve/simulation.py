@@ -181,10 +181,9 @@ def _may_snap_wrongly(scene: Plan) -> bool:
 
     In a snap of a narrow spread the smallest error of a strain may enter the wrong branch.
     """
-    laws = scene.laws.made
-    if scene.solver != plans.FIRST_ORDER or len(laws) == len(scene.ends):
+    if scene.solver != plans.FIRST_ORDER or len(scene.laws.made) == len(scene.ends):
         return False
-    return any(one.kind == BY_STRESS for one in laws)
+    return any(one.kind == BY_STRESS for one in scene.laws.made)
 
 
 def _resolve_vibrations(
@@ -209,9 +208,10 @@ def _resolve_vibrations(
 
 def _is_long(scene: Plan, motion: Motion, few: int) -> bool:
     """Whether a motion took many steps or switches (the steps of an aggregate are switches)."""
+    if motion.steps > few:
+        return motion.method != plans.AGGREGATE
     bounces = len(scene.ends) > 1 or scene.speed == 0.0
-    many = scene.solver == plans.SECOND_ORDER and len(motion.switches) > FEW_SWITCHES
-    return (motion.steps > few or (bounces and many)) and motion.method != plans.AGGREGATE
+    return bounces and scene.solver == plans.SECOND_ORDER and len(motion.switches) > FEW_SWITCHES
 
 
 def _hard(scene: Plan, arrays: ChainArrays) -> bool:
