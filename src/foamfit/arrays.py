@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-_Given = ParamSpec("_Given")
-_Result = TypeVar("_Result")
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 def means(values: Array, starts: Integers) -> Array:
@@ -21,18 +19,13 @@ def means(values: Array, starts: Integers) -> Array:
     return np.asarray(np.add.reduceat(values, starts) / np.diff(np.append(starts, len(values))))
 
 
-def single_threaded(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
+def single_threaded(function: F) -> F:
     """Decorate a function so that its linear algebra runs in one thread.
 
     The matrices are small: several threads mostly wait for each other (forty times longer than
     they work, on a busy machine), and the rounding depends on the number of threads.
     """
+    from threadpoolctl import threadpool_limits
 
-    @wraps(function)
-    def run(*args: _Given.args, **options: _Given.kwargs) -> _Result:
-        from threadpoolctl import threadpool_limits
-
-        with threadpool_limits(1, user_api="blas"):
-            return function(*args, **options)
-
-    return run
+    limited: F = threadpool_limits.wrap(1, user_api="blas")(function)
+    return limited

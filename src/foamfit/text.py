@@ -6,7 +6,7 @@ import math
 import re
 import shutil
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from decimal import Decimal
 
 # Line length, characters: that of the terminal, within these limits.
@@ -93,6 +93,16 @@ def listed(items: Iterable[str]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
+def option_value(value: object) -> str:
+    """Write the value of an option: "1.5", "s1_eta=0,s1_k0=6e+07"."""
+    if isinstance(value, Mapping):
+        return ",".join(f"{key}={option_value(one)}" for key, one in sorted(value.items()))
+    if isinstance(value, list):
+        return ",".join(map(option_value, value))
+    short = isinstance(value, float) and float(f"{value:g}") == value
+    return f"{value:g}" if short else str(value)
+
+
 def line_width() -> int:
     """Return the line length of the terminal; `WIDTH` at most, and without a terminal."""
     return max(min(shutil.get_terminal_size((WIDTH, 24)).columns, WIDTH), NARROWEST)
@@ -109,17 +119,23 @@ def wrapped(text: str, indent: int = 2, width: int | None = None) -> list[str]:
     return [line.replace(f"{_NO_BREAK}%", " %") for line in lines]
 
 
-def aligned(rows: Sequence[Sequence[str]], gap: str = "  ", right: Iterable[int] = ()) -> list[str]:
+def aligned(
+    rows: Sequence[Sequence[str]],
+    gap: str = "  ",
+    right: Iterable[int] = (),
+    most: int | None = None,
+) -> list[str]:
     """Align rows of cells as a table; the first row is the header.
 
     Columns whose indices are in `right` are right-aligned, all others left-aligned. Columns that do
-    not fit on the line follow in a second table, which repeats the first column.
+    not fit into `most` characters, by default the line, follow in a second table, which repeats
+    the first column.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    right, blocks = set(right), [[0]]
+    right, blocks, most = set(right), [[0]], most or line_width()
     for i, width in enumerate(widths[1:], start=1):
         taken = sum(widths[j] + len(gap) for j in blocks[-1])
-        if taken + width > line_width() and len(blocks[-1]) > 1:
+        if taken + width > most and len(blocks[-1]) > 1:
             blocks.append([0])
         blocks[-1].append(i)
     lines = list[str]()

@@ -344,7 +344,7 @@ def test_the_command_prints_counts_parameters_and_refusals(here, tried, monkeypa
     assert result.exit_code == 2
     assert result.stdout.startswith("4 tests: 3 fitted with warnings and 1 refused\n")
     assert "\nbad: tests/bad.csv: " in result.stdout
-    assert re.search(r"\ns1_k0 +5\.5 +5\.5 +5\.5 +3 of 3 +MPa\n", result.stdout)
+    assert re.search(r"\ns1_k0 +MPa +5\.500 +5\.500 +5\.500 +3 of 3\n", result.stdout)
     assert result.stdout.endswith("written to out: open out/summary.html\n")
     assert result.stderr == "foamfit: 1 of 4 tests has no acceptable fit; see out/summary.csv\n"
     words = ("--specimen", "foam.toml", "--no-report", "--out", "out")

@@ -23,6 +23,7 @@ from foamfit.cli.progress import Progress, progress_line
 from foamfit.errors import InputError
 from foamfit.options import FREED, OPTIONS
 from foamfit.terminal import say
+from foamfit.text import option_value
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -126,21 +127,11 @@ def folder_name(options: Mapping[str, Any]) -> str:
     parts = [options["model"]]
     for name in sorted(options.keys() - {"model"}, key=lambda one: ((*FIRST, one).index(one), one)):
         value, shown = options[name], name.replace("_", "-")
-        named = _words(value) if name in BARE else f"{shown}-{_words(value)}"
+        named = option_value(value) if name in BARE else f"{shown}-{option_value(value)}"
         parts.append(shown if value is True else named)
     whole = re.sub(r"[^\w.,+=-]+", "-", "-".join(parts))
     mark = hashlib.sha256(whole.encode()).hexdigest()[:8]
     return whole if len(whole) <= LONGEST else f"{whole[: LONGEST - 9]}-{mark}"
-
-
-def _words(value: Any) -> str:
-    """Return the value of an option as part of a name."""
-    if isinstance(value, Mapping):
-        return ",".join(f"{key}={_words(one)}" for key, one in sorted(value.items()))
-    if isinstance(value, list):
-        return ",".join(map(_words, value))
-    short = isinstance(value, float) and float(f"{value:g}") == value
-    return f"{value:g}" if short else str(value)
 
 
 @main.command()

@@ -5,7 +5,6 @@ Each window has its own folder, which is removed with it. Windows share nothing.
 
 from __future__ import annotations
 
-import io
 import math
 import re
 import shlex
@@ -14,7 +13,6 @@ import tempfile
 import time
 import tomllib
 import unicodedata
-import zipfile
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -230,7 +228,8 @@ class Desk:
     def zipped(self) -> bytes:
         """Return the result folder as a ZIP, with the TOML of the test."""
         assert self.result is not None
-        return _zip(self.result, {SAVED_TOML: self.result.with_suffix(".toml")})
+        shutil.copy(self.result.with_suffix(".toml"), self.result / SAVED_TOML)
+        return _zip(self.result)
 
     def card(self, cycle: int) -> bytes:
         """Return an LS-DYNA card of the fit of a cycle (0: a single fit) as a ZIP."""
@@ -238,7 +237,7 @@ class Desk:
 
         with tempfile.TemporaryDirectory() as folder:
             card(self.fits[cycle], format="mat083").save(Path(folder, "foam.k"))
-            return _zip(Path(folder), {})
+            return _zip(Path(folder))
 
     def planned(self, cycle: int) -> bytes:
         """Return plan.html, the plan after the fit of a cycle (0: a single fit)."""
@@ -249,15 +248,10 @@ class Desk:
             return Path(folder, "plan", "plan.html").read_bytes()
 
 
-def _zip(folder: Path, more: Mapping[str, Path]) -> bytes:
-    """Return the files of a folder, and more by their names, as a ZIP."""
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path in sorted(folder.rglob("*")):
-            archive.write(path, path.relative_to(folder))
-        for name, path in more.items():
-            archive.write(path, name)
-    return content.getvalue()
+def _zip(folder: Path) -> bytes:
+    """Return the files of a folder as a ZIP."""
+    with tempfile.TemporaryDirectory() as place:
+        return Path(shutil.make_archive(f"{place}/result", "zip", folder)).read_bytes()
 
 
 def wrong_quantity(message: str) -> str:

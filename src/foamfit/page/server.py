@@ -40,11 +40,8 @@ class Refusal(web.RequestHandler):
     """Rejects every request."""
 
     def prepare(self) -> None:
-        """Answer with plain text that no browser interprets as a page."""
-        self.set_status(403)
-        self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.set_header("X-Content-Type-Options", "nosniff")
-        self.finish(REFUSED)
+        """Answer with a page that has the reason."""
+        raise web.HTTPError(403, reason=REFUSED)
 
 
 class Guard(routing.Router):

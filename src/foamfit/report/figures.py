@@ -50,6 +50,7 @@ COLUMNS = {"one": 3.25, TWO: 7.0}
 NARROWEST, WIDEST = 2.5, 20.0
 UNTITLED = "untitled"  # option after a width and a comma
 LINE = 11.0 / 72.0  # height of a line of a title or a legend, inches
+LETTERS = 14  # letters of a title per inch
 
 
 def inches(width: str) -> float:
@@ -99,25 +100,13 @@ def drawing(width: float, height: float, *title: str) -> Iterator[Figure]:
     import matplotlib
     from matplotlib.figure import Figure
 
-    lines = _fitting(title, width)
+    lines = [line for part in title for line in wrapped(part, 0, int(LETTERS * width))]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(width, height + LINE * len(lines)), layout="constrained")
         if lines:  # a dollar sign in a name does not start a formula
             style: Any = {"fontsize": 8, "parse_math": False}
             figure.suptitle("\n".join(lines), x=0.01, ha="left", **style)
         yield figure
-
-
-def _fitting(title: Sequence[str], width: float) -> list[str]:
-    """Return a title in lines that fit into a width (inches) at 8 pt."""
-    from matplotlib.textpath import TextPath
-
-    for per_inch in (16, 14, 12, 10, 8):
-        lines = [line for part in title for line in wrapped(part, 0, int(per_inch * width))]
-        paths = (TextPath((0.0, 0.0), line.replace("$", "S"), size=8) for line in lines)
-        if max((path.get_extents().x1 for path in paths), default=0.0) <= 0.97 * 72.0 * width:
-            break
-    return lines
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+import sys
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -27,7 +28,7 @@ from foamfit.report.summary import CURVES
 from foamfit.results import Fit
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import counted, listed, percent
+from foamfit.text import aligned, counted, listed, option_value, percent
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,7 +76,7 @@ class Row:
 
     @property
     def counts(self) -> tuple[int, int]:
-        """How many parameters of the springs are determined, and how many are varied."""
+        """How many parameters of the springs are determined, and how many have a state."""
         return tables.count_determined(self.parameters)
 
     @property
@@ -96,11 +97,7 @@ class Row:
 def lines(results: Sequence[Row], top: Path) -> str:
     """Return a line for each result in the folder `top`, below a head."""
     rows = [HEAD, *([*one.cells, str(one.place.relative_to(top))] for one in results)]
-    wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, wide, strict=True)).rstrip()
-        for row in rows
-    )
+    return "\n".join(aligned(rows, most=sys.maxsize))
 
 
 def results_in(folder: str | Path) -> list[Row]:
@@ -124,9 +121,8 @@ def _listed(path: Path) -> Row:
         content = load_result(path)
         model = Model.of_result(content)
         given = content.get("options") or {"drive": content.get("drive")}
-        rest = {
-            k: v for k, v in given.items() if k not in ("model", "relaxation") and v is not None
-        }
+        named = {k: v for k, v in given.items() if k not in ("model", "relaxation") and v}
+        rest = (k if v is True else f"{k} {option_value(v)}" for k, v in named.items())
         misfit = content.get("misfit") or _largest(content.get("tests", {}))
         every = content["parameters"].items()
         made = {n: {"vary": p.get("kind") != "fixed", **p} for n, p in every if n not in NUISANCE}
@@ -137,20 +133,13 @@ def _listed(path: Path) -> Row:
             runtime_s=decode(float | None, content.get("runtime_s"), {}),
             parameters={name: build(ParameterEstimate, p, {}) for name, p in made.items()},
             model=law_in_words(model.name, content.get("relaxation", 0)),
-            options=", ".join(k if v is True else f"{k} {_shown(v)}" for k, v in rest.items()),
+            options=", ".join(rest),
             place=place,
             when=when,
         )
     except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
         why = str(error) if isinstance(error, InputError) else f"{path.name} is damaged"
         return Row(place.name, status="failed", error=why, place=place, when=when)
-
-
-def _shown(value: Any) -> str:
-    """Return the value of an option as on the command line."""
-    if isinstance(value, dict):
-        return " ".join(f"{name}={one}" for name, one in value.items())
-    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def _largest(tests: dict[str, Any]) -> dict[str, float]:
@@ -311,7 +300,7 @@ def summary_words(rows: Sequence[Row]) -> str:
     for name, each in tables.varied([row.parameters for row in rows if row.has_fit]).items():
         present = [p for p in each if p is not None]
         factor, unit = tables.unit_of_all(present)
-        quartiles = np.quantile([p.value / factor for p in present], [0.5, 0.25, 0.75])
+        quartiles = np.quantile([p.value / factor for p in present], [0.5, 0.25, 0.75]).tolist()
         parameters.append((name, quartiles, unit, [p.state for p in present]))
     return words(
         "batch",

@@ -278,7 +278,7 @@ def _draw_strip(ax: Axes, result: Fit, overall: Array, at: list[int]) -> None:
             ax.bar(number, tall, 0.5, floor, color=STANDING, edgecolor=GREY, lw=0.6)
             ax.bar(number, share * tall, 0.5, floor, color=SNAPPED)
             floor += tall
-        label = f"{number}: {100 * float(overall[sample]):.0f} %"
+        label = f"{number}: {round(100 * float(overall[sample]))} %"
         ax.annotate(label, (number, floor), (0, 3), textcoords="offset points", ha="center")
     ax.set(ylim=(0.0, 1.25), xlim=(0.4, len(at) + 0.6))
     ax.set_title("shaded: snapped fraction; numbers: strain", loc="left", fontsize=7.5)

@@ -50,7 +50,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
         "shown": [(name, percent(misfit)) for name, misfit in compared(result).items()],
         "fixed": [row for row in rows if row.state == "fixed"],
         "determined": determined(result),
-        "unknown": _unknown({n: p for n, p in result.parameters.items() if n not in NUISANCE}),
+        "unknown": _unknown(_of_springs(result), "report"),
         "remedies": [one.lines[0] for one in result.contradictions if one.lines],
     }
     *lines, last = _screen(result, rows, values, verbose=verbose)
@@ -149,7 +149,7 @@ def conclusions(result: Fit) -> tuple[str, ...]:
     Further sentences state the effect of the ± of the TOML and, for microscale springs and
     relaxation, the behaviour of the identified law.
     """
-    springs = {name: p for name, p in result.parameters.items() if name not in NUISANCE}
+    springs = _of_springs(result)
     halves = {  # half of the 95 % interval over the value
         name: 0.5 * (p.ci95[1] - p.ci95[0]) / abs(p.value)
         for name, p in springs.items()
@@ -165,11 +165,15 @@ def conclusions(result: Fit) -> tuple[str, ...]:
         determined=found,
         varied=varied,
         widths=widths[:1] + widths[1:][-1:],
-        unknown=_unknown(springs),
+        unknown=_unknown(springs, "table of parameters"),
         weakest=[] if result.insight is None else list(result.insight.weakest()[1]),
         stated=STATED if result.budget is None else [*filter(result.budget.sources.count, STATED)],
         moved=_moved(result),
     )
+
+
+def _of_springs(result: Fit) -> dict[str, ParameterEstimate]:
+    return {name: p for name, p in result.parameters.items() if name not in NUISANCE}
 
 
 def determined(result: Fit) -> str:
@@ -178,8 +182,10 @@ def determined(result: Fit) -> str:
     return f"{found} of {varied} determined" if varied else ""
 
 
-def _unknown(parameters: dict[str, ParameterEstimate]) -> dict[str, dict[str, list[str]]]:
-    """Group the weak and undetermined parameters by state and reason."""
+def _unknown(
+    parameters: dict[str, ParameterEstimate], place: str
+) -> dict[str, dict[str, list[str]]]:
+    """Group the weak and undetermined parameters by state and reason, or by its `place` if long."""
     grouped = dict[str, dict[str, list[str]]]()
     for state in ("not determined", "weak"):
         every = {name: p.why for name, p in parameters.items() if p.state == state}
@@ -187,7 +193,7 @@ def _unknown(parameters: dict[str, ParameterEstimate]) -> dict[str, dict[str, li
         groups = {why: [name for name, own in every.items() if own == why] for why in reasons}
         text = "; ".join(f"{', '.join(names)} ({why})" for why, names in groups.items())
         if len(text) > LONGEST:
-            groups = {"reasons in the report": list(every)}
+            groups = {f"reasons in the {place}": list(every)}
         if groups:
             grouped[state] = groups
     return grouped

@@ -72,9 +72,12 @@ def parameters_tex(parameters: Parameters, **more: Any) -> str:
 
 
 def count_determined(parameters: Parameters) -> tuple[int, int]:
-    """Return how many parameters of the springs are determined, and how many are varied."""
-    varied = [p for name, p in parameters.items() if p.vary and name not in NUISANCE]
-    return sum(p.state == "determined" for p in varied), len(varied)
+    """Return how many parameters of the springs are determined, and how many have a state.
+
+    Own parameters of a joint fit have none.
+    """
+    judged = [p for name, p in parameters.items() if p.vary and p.state and name not in NUISANCE]
+    return sum(p.state == "determined" for p in judged), len(judged)
 
 
 def varied(each: Sequence[Parameters]) -> dict[str, list[ParameterEstimate | None]]:

@@ -90,7 +90,8 @@ class Batch:
         rows, recipe, picture = self.summary, self.recipe, None
         tables.write_summary(rows, self.out)
         law = law_in_words(recipe.model, recipe.options["relaxation"])
-        title = f"{self.out.resolve().name}: {law}"
+        name = self.out.resolve().name
+        title = law if name == recipe.model else f"{name}: {law}"
         if whole:
             how: Any = {"width": recipe.width, "pictures": recipe.pages}
             picture = tables.write_comparison(rows, self.out, title, **how)

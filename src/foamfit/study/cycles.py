@@ -26,7 +26,7 @@ from foamfit.report.readable import own_name
 from foamfit.report.render import words
 from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
 from foamfit.report.summary import CURVES
-from foamfit.report.tables import by_test_tex, frame, stacked, varied, wide
+from foamfit.report.tables import by_test, by_test_tex, frame, stacked, varied, wide
 from foamfit.results import Fit, stamp
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, percent
@@ -104,9 +104,14 @@ class CycleFits(Result):
 
     def text(self, *, verbose: bool = False) -> str:
         """Return the text that the command prints."""
-        names = list(self.varied) if len(self.varied) <= MOST_NAMES else []
-        shown = {name: own_name(name, self.model) for name in names}
-        return words("cycles", found=self, names=shown)
+        shown = self.varied if len(self.varied) <= MOST_NAMES else {}
+        table = by_test([str(number) for number in sorted(self.results)], shown)
+        heads = [
+            f"{own_name(name, self.model)} ({unit})".removesuffix(" ()")
+            for name, (_, unit) in zip(shown, table["heads"], strict=True)
+        ]
+        cells = {cycle: [p.value if p else "–" for p in row] for cycle, *row in table["rows"]}
+        return words("cycles", found=self, heads=heads, cells=cells)
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the loops of all cycles, measured and fitted, into axes or a new figure."""
