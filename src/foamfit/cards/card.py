@@ -17,11 +17,9 @@ from foamfit.arrays import Array, single_threaded
 from foamfit.cards import loading
 from foamfit.codec import plain
 from foamfit.data.cycles import loading_rate
-from foamfit.data.noise import with_noise
 from foamfit.data.units import factor
 from foamfit.errors import InputError
 from foamfit.files import check_file, write_file
-from foamfit.fitting.curves import driving_motion
 from foamfit.parts import law_in_words
 from foamfit.report.figures import BLUE, SEEN, TWO, VERMILION, images
 from foamfit.report.folder import Result
@@ -73,10 +71,6 @@ class Record:
         moved = c.displacement if measured is None else measured
         if c.measured_stress is None or moved is None:
             raise InputError(f"{test.name} has no measured loop; a card needs force and motion")
-        if not impact and any(one.get("motion_smoothed") for one in result.noise.values()):
-            times = np.arange(moved.size, dtype=float) if c.time is None else c.time
-            smooth = driving_motion(with_noise(test), times, always=True)  # as in the fit
-            moved = moved if smooth is None else smooth.at(times)
         fitted = c.stress if impact else c.stress_along
         stress, fitted = (
             result.nuisance("force_scale", 1.0) * (one - result.zero_of("stress"))

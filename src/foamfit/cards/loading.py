@@ -124,7 +124,8 @@ def curves_at(source: Source, rates: Sequence[float], measured_to: float) -> tup
     stress = np.maximum.accumulate(rising, axis=0)
     scale = float(stress[:, within].max())
     kept = within | (stress.max(axis=0) <= MOST * scale)
-    strain = _points(fine[kept], stress[:, kept] / scale, measured_to)
+    strain = np.linspace(0.0, fine[kept][-1], POINTS)
+    strain[np.argmin(np.abs(strain - measured_to))] = measured_to
     chosen = np.array([np.interp(strain, fine, one) for one in stress])
     crossed = bool(np.any(stress - rising > _CLOSE * scale))
     return Curves(np.array(rates), strain, chosen, measured_to), crossed
@@ -144,19 +145,6 @@ def _reached(source: Source, rates: Sequence[float], measured_to: float) -> tupl
     raise ended
 
 
-def _points(fine: Array, stress: Array, measured_to: float) -> Array:
-    """Choose the strains of a card, dense where a curve bends; `measured_to` is one of them."""
-    # The error of linear interpolation is proportional to the curvature times the square of the
-    # spacing. It is taken relative to the stress, or to the largest measured stress (1) if larger.
-    bend = np.abs(np.gradient(np.gradient(stress, fine, axis=1), fine, axis=1))
-    density = np.sqrt((bend / np.maximum(stress, 1.0)).max(axis=0))
-    density = density / density.mean() + 0.5
-    share = cumulative_trapezoid(density, fine, initial=0)
-    strain = np.interp(np.linspace(0.0, share[-1], POINTS), share, fine)
-    strain[np.argmin(np.abs(strain - measured_to))] = measured_to
-    return np.asarray(strain)
-
-
 def guessed(source: Source, curves: Curves) -> list[str]:
     """Return the parameters that affect the curves but are not determined by the tests."""
     open_ = [name for name, one in source.parameters.items() if one.state == "not determined"]
@@ -167,10 +155,9 @@ def guessed(source: Source, curves: Curves) -> list[str]:
     return [name for name in open_ if np.abs(changes[name]).max() > least]
 
 
-# Bounds of HU, SHAPE and EXPON, and starting points of their search. HU = 0 would switch off the
-# hysteresis.
+# Bounds and start of HU, SHAPE and EXPON. HU = 0 would switch off the hysteresis.
 _LEAST, _MOST = (1e-3, 0.05, 0.05), (1.0, 50.0, 50.0)
-_STARTS = ((0.2, 0.5, 0.9), (0.2, 2.0, 0.9), (0.5, 5.0, 1.1), (0.1, 1.0, 0.5))
+_START_AT = (0.2, 2.0, 0.9)
 _WINDOW = 0.03  # smoothing window of the strain, as a fraction of the samples of a record
 
 
@@ -278,5 +265,5 @@ def fit_unloading(
         return np.concatenate([w * (replay(unloading) - target) for replay, target, w in triples])
 
     bounds = (np.log(_LEAST)[free], np.log(_MOST)[free])
-    found = [least_squares(residuals, np.log(start)[free], bounds=bounds) for start in _STARTS]
-    return Unloading(*np.exp(min(found, key=lambda one: one.cost).x).tolist())
+    found = least_squares(residuals, np.log(_START_AT)[free], bounds=bounds)
+    return Unloading(*np.exp(found.x).tolist())
