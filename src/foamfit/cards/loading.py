@@ -37,7 +37,6 @@ END, MOST = 0.9, 10.0
 _ENDS = 20  # ends of the curves that are tried
 _FINE = 2000  # intervals of the strain from which the points are chosen
 _LEAST_SLOPE = 1e-3  # least slope of a curve over its mean slope within the measured strain
-_START = 0.01  # strain over which the initial jump due to a dashpot is spread
 _SAME = 0.1  # rates that differ by a smaller fraction count as equal
 _CLOSE = 0.01  # smaller differences of stress, over its range, are ignored
 
@@ -116,9 +115,7 @@ def curves_at(source: Source, rates: Sequence[float], measured_to: float) -> tup
     ends = (min(source.rates), max(source.rates)) if source.rates else (rates[0], rates[0])
     fine, raw = _reached(source, np.clip(rates, *ends).tolist(), measured_to)
     within = fine <= measured_to
-    jumps = np.maximum(2.0 * raw[:, 1:2] - raw[:, 2:3], 0.0)
-    raw = raw - jumps * np.maximum(1.0 - fine / _START, 0.0)
-    raw[:, 0] = 0.0
+    raw[:, 0] = 0.0  # the jump due to a dashpot is spread over the first interval
     line = _LEAST_SLOPE * raw[:, within].max() / measured_to * fine
     rising = np.maximum.accumulate(raw - line, axis=1) + line
     stress = np.maximum.accumulate(rising, axis=0)

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 LEAST_PANEL, LETTER = 0.62, 0.052  # least width of a panel and width of a letter, inches
 TALLEST, ROW, ABOVE = 7.5, 0.17, 2.5  # heights of all panels, a row and the panel above, inches
 MOST_ROWS = 60  # tests that are named
-MANY = 300  # tests beyond which marks are stored as pixels, because their outlines are too large
 ROOMY = 0.8  # width of a panel with room for more numbers, inches
 # Colours of edge and face of the marks.
 _MARKS = {"determined": (BLUE, BLUE), "weak": (BLUE, "white"), "not determined": (GREY, "white")}
@@ -149,8 +148,6 @@ def _draw(ax: Axes, panel: Panel, tests: Sequence[str], roomy: bool) -> None:
     if not panel.has_law:
         size = 3.4 if len(tests) <= 25 else 2.4 if len(tests) <= MOST_ROWS else 1.4
         _draw_values(ax, rows, factor, size)
-    for artist in (*ax.lines, *ax.collections):
-        artist.set_rasterized(len(tests) > MANY)
 
 
 def _draw_values(
