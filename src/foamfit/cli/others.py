@@ -330,7 +330,7 @@ def predict(
 def plan(
     results: tuple[str, ...], rig: Path | None, quantity: str | None, seed: int, output: Output
 ) -> None:
-    """Find the test that would determine most of what the results leave open.
+    """Find the next test: the one that would determine most.
 
     RESULT is the folder of a fit or joint fit, or a published set. Several results of one model are
     tests of one foam; a result of another model is a rival, which the test should tell apart.

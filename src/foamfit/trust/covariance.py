@@ -27,10 +27,10 @@ Ends = tuple[float, float]
 # and not determined if it exceeds NOTHING times its scale.
 WEAK, NOTHING = 0.5, 3.0
 RULE = (
-    f"Determined: 95 % interval and range are both within ±{WEAK:.0%} of the parameter's scale "
-    "(its value, unless its sentence names another).",
-    f"Not determined: one of them is wider than ±{NOTHING:.0%}, or its branch was never reached. "
-    "Otherwise weak.",
+    f"Determined: 95 % interval and range are both within ±{percent(WEAK)} of the parameter's "
+    "scale (its value, unless its sentence names another).",
+    f"Not determined: one of them is wider than ±{percent(NOTHING)}, or its branch was never "
+    "reached. Otherwise weak.",
 )
 # A parameter is at a limit if its distance to it, over its scale, is no more than this.
 AT_LIMIT = 1e-6
