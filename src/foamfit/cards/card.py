@@ -23,7 +23,7 @@ from foamfit.files import check_file, write_file
 from foamfit.parts import law_in_words
 from foamfit.report.figures import BLUE, SEEN, TWO, VERMILION, images
 from foamfit.report.folder import Result
-from foamfit.report.panels import Line, Panel
+from foamfit.report.panels import AXES, Line, Panel
 from foamfit.report.plots import panelled
 from foamfit.report.render import environment, sentences
 from foamfit.results import Fit
@@ -230,7 +230,7 @@ def draw(card: Card) -> Figure:
     shown, curves = sorted(card.records, key=lambda one: one.rate or 0.0), card.curves
     if len(shown) > MOST:
         shown = [shown[0], shown[-1]]
-    axes, panels = (("strain", "–"), ("stress", "Pa")), list[Panel]()
+    axes, panels = AXES["stress-strain"], list[Panel]()
     for one in shown:
         pairs = ((one.strain, one.stress), (one.motion, one.fitted), (one.motion, one.card))
         lines = [Line(*pair, *look) for pair, look in zip(pairs, LOOKS, strict=True)]

@@ -19,17 +19,12 @@ from foamfit.arrays import Array
 from foamfit.page.inputs import WIDE, Sliders, grid, piece
 from foamfit.page.turning import PANELS, Drawn, Row, Turning
 from foamfit.report.figures import GREY, VERMILION
-from foamfit.report.readable import readable_unit
+from foamfit.report.panels import AXES, Line, Panel
 from foamfit.report.summary import CURVES
 from foamfit.text import percent
 
 MOST_DRAWN, MOST_MARKERS = 400, 150  # largest number of points of a simulated and a measured curve
 NOTHING = np.empty(0), np.empty(0)
-AXES = {  # name and SI unit of x and y in each panel
-    "stress_time": (("time", "s"), ("stress", "Pa")),
-    "displacement_time": (("time", "s"), ("displacement", "m")),
-    "stress_strain": (("strain", ""), ("stress", "Pa")),
-}
 
 
 class Curves:
@@ -142,12 +137,9 @@ class Curves:
             self._panes[name].visible = measured is not None
             if measured is None:
                 continue
-            (x_name, x_si), (y_name, y_si) = AXES[name]
-            fx, x_unit = readable_unit(float(abs(measured[0]).max()), x_si)
-            fy, y_unit = readable_unit(float(abs(measured[1]).max()), y_si)
+            panel = Panel(CURVES[name], *AXES[CURVES[name]], [Line(*measured, "", {})])
+            fx, made.xaxis.axis_label, fy, made.yaxis.axis_label = panel.scale()
             self._scales[name] = fx, fy
-            made.xaxis.axis_label = f"{x_name} ({x_unit})" if x_unit else x_name
-            made.yaxis.axis_label = f"{y_name} ({y_unit})"
             some = self._some(measured[0], MOST_MARKERS)
             x, y = measured[0] / fx, measured[1] / fy
             self._measured[name].data = {"x": x[some], "y": y[some]}

@@ -27,6 +27,13 @@ DASHES: Any = ((0, (5, 1.2)), (0, (2.5, 1.2)), (0, (1, 1)), (0, (5, 1.2, 1, 1.2)
 MARKS = ("^", "v", "D", "p")
 
 
+AXES = {  # name and SI unit of x and y in each panel
+    "stress-time": (("time", "s"), ("stress", "Pa")),
+    "displacement-time": (("time", "s"), ("displacement", "m")),
+    "stress-strain": (("strain", "–"), ("stress", "Pa")),
+}
+
+
 @dataclass(frozen=True)
 class Line:
     """A curve of a panel in SI, or with `high` a band between two curves."""
@@ -106,11 +113,10 @@ def panels_of(result: Fit) -> list[Panel]:
         loop.append(Line(strain, c.stress_along, "springs along measured strain", pale))
     pushed_off = _residual(c.time, c.measured_stress, compared("stress_time", c.stress))
     looped_off = _residual(strain, c.measured_stress, compared("stress_strain", c.stress_along))
-    time, stress = ("time", "s"), ("stress", "Pa")
     panels = [
-        Panel("stress-time", time, stress, pushing, pushed_off),
-        Panel("displacement-time", time, ("displacement", "m"), moving, off),
-        Panel("stress-strain", ("strain", "–"), stress, loop, looped_off),
+        Panel("stress-time", *AXES["stress-time"], pushing, pushed_off),
+        Panel("displacement-time", *AXES["displacement-time"], moving, off),
+        Panel("stress-strain", *AXES["stress-strain"], loop, looped_off),
     ]
     if is_known(result):
         panels = [panels[2], panels[0]]

@@ -17,7 +17,7 @@ from foamfit.parts import OfLaw, ParameterEstimate
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, INSIDE, TWO, VERMILION
 from foamfit.report.folder import Result, write_columns, write_json
-from foamfit.report.panels import Line, Panel, measured
+from foamfit.report.panels import AXES, Line, Panel, measured
 from foamfit.report.plots import panelled
 from foamfit.report.render import words
 from foamfit.results import flags_of, stamp
@@ -226,7 +226,7 @@ def _panels(found: Prediction) -> list[Panel]:
         for way in (slice(None, turn + 1), slice(turn, None)):
             if stress is not None and moved is None:
                 loop.append(Line(strain[way], stress.lo[way], *BAND, high=stress.hi[way]))
-        panels.append(Panel("stress-strain", ("strain", "–"), ("stress", "Pa"), loop))
+        panels.append(Panel("stress-strain", *AXES["stress-strain"], loop))
     for c in found.curves.values():
         timed = ("time", "s") if m.time is not None else ("sample", "–")
         x = m.instants
