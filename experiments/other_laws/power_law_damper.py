@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 
 import foamfit as ff
-from foamfit.springs import law as formulas
 from foamfit.springs import laws
+from foamfit.springs.laws import bistable as formulas
 
 PAPER = laws.law("bistable")
 points_of = njit(formulas.derived_points)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.signal import find_peaks
 
 import foamfit as ff
-from foamfit.springs.law import BRANCH_NAMES
+from foamfit.springs import laws
 
 Array = NDArray[np.float64]
 
@@ -195,7 +195,7 @@ def spring_strain(chain: ff.Chain, got: ff.Response) -> Array:
 
 def closing_velocity(name: str, interior: bool = True) -> float:
     """Return the least velocity (m/s) at which the impact reaches branch c."""
-    chain, c = impact_scene(name, interior), BRANCH_NAMES.index("c")
+    chain, c = impact_scene(name, interior), [*laws.law("bistable").branches].index("c")
     return least(lambda v: bool(np.any(struck(chain, v).switches[:, 3] == c)), 1.0, 8.0, 1e-6)
 
 

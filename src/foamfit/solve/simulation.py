@@ -53,7 +53,8 @@ class Response:
     #: under one stress) or "Radau IIA" (implicit steps, where light masses or dashpots make the
     #: scene stiff; they damp unresolved vibrations)
     method: str
-    #: time (s), spring (0 at the base), branch left, branch entered, and strain, (m, 5)
+    #: time (s), spring (0 at the base), branch left, branch entered (numbers in the order of
+    #: `spring.law.branches`), and strain, (m, 5)
     switches: Array
     steps: int  #: number of integration steps; 0 for the closed form
     #: derivatives by the requested parameters

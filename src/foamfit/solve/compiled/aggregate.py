@@ -26,9 +26,9 @@ from foamfit.springs.compiled.bistable import A, C, D, E
 from foamfit.springs.compiled.contract import MISS, OF_LAW, SLOPE, inner, past
 from foamfit.springs.laws.record import Law
 
-# Columns of the shape of a branch: 1 if curved, slope k, origins of strain and stress, stresses at
-# its ends.
-CURVED, STEEP, ORIGIN, OFFSET, FIRST, LAST, SHAPE = range(7)
+# The shape of a branch: 1 if curved, slope k, origins of strain and stress, stresses at its ends.
+CURVED, STEEP, ORIGIN, OFFSET, FIRST, LAST = range(bistable.SHAPE)
+SHAPE = bistable.SHAPE
 DEGREE = 16  # of the polynomial
 # Range of the polynomial about its anchor, as a share of the distance to the nearest pole. The
 # relative truncation error of the strain is below 0.125**17 < 1e-15.
@@ -243,27 +243,10 @@ def row_of(laws: tuple[contract.Compiled, ...], rows: Array, heights: Array) -> 
     They must be undamped bistable and linear springs without flat branches and gaps; `rows` have no
     relaxation terms.
     """
-    own, count = rows[:, 1:], len(heights)
-    snapping = np.array([one.columns == bistable.COLUMNS for one in laws])
-    linear = np.array([one.columns == 2 for one in laws])
-    if not (snapping | linear).all() or rows[:, 0].any() or (own[linear, 1] > 0.0).any():
+    if rows[:, 0].any() or not {bistable.COMPILED, bistable.LINEAR}.issuperset(laws):
         return None
-    shapes = np.zeros((count, 4, SHAPE))
-    shapes[:, :, FIRST], shapes[:, :, LAST] = -math.inf, math.inf
-    shapes[linear, :, STEEP] = own[linear, :1]
-    ends = {
-        A: (None, bistable.EPS_A),
-        D: (bistable.EPS_A, bistable.EPS_HAT_C),
-        C: (bistable.EPS_C, None),
-        E: (bistable.EPS_HAT_A, bistable.EPS_C),
-    }
-    for branch, places in ends.items():
-        first = bistable.TABLE + branch * bistable.WIDE
-        shapes[snapping, branch, CURVED] = float(branch in (A, C))
-        shapes[snapping, branch, STEEP:FIRST] = own[snapping, first : first + 3]
-        for column, end in zip((FIRST, LAST), places, strict=True):
-            if end is not None:
-                shapes[snapping, branch, column] = own[snapping, bistable.TO_STRESS + end]
+    count = len(heights)
+    shapes = rows[:, 1:].reshape(count, 4, bistable.WIDE)[:, :, :SHAPE]
     steep = shapes[:, :, STEEP]
     if not (steep > 0.0).all():
         return None

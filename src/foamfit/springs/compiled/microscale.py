@@ -26,9 +26,9 @@ from foamfit.springs.compiled import contract
 from foamfit.springs.compiled import mixture as mix
 from foamfit.springs.compiled.contract import BY, BY_HELD, MISS, OF_LAW, SLOPE, inner, past, start
 from foamfit.springs.compiled.mixture import AGAIN, BACK, BOTH, FIXED, SNAP, A, at_stress, shares
-from foamfit.springs.law import LEAST_RANK, crossing, most_beyond
+from foamfit.springs.laws.microscale import most_beyond
 
-_crossing, _most_beyond = inner(crossing), inner(most_beyond)
+_most_beyond = inner(most_beyond)
 
 
 @njit(**contract.OPTIONS, cache=True)
@@ -51,7 +51,7 @@ def fill(values, array):
     row.log_minus, row.minus, row.n = math.log(values[5]), values[6], n
     row.worn, row.log_again = row.k0 * math.exp(-softening), row.log_plus - weakening
     row.remembers = 1.0 if count > 7 else 0.0
-    row.cross = _crossing(row.log_again, row.plus, row.log_minus, row.minus)
+    row.cross = mix.crossing(row.log_again, row.plus, row.log_minus, row.minus)
     least, _ = _most_beyond(row.worn, row.kc, n)
     return row.worn > 0.0 and row.star >= least
 
@@ -99,8 +99,8 @@ def _has_loop(row, sigma, up):
 @inner
 def _last_stress(row):
     """Return the stress at which the last micro-spring has snapped back."""
-    through = row.log_again + row.plus * LEAST_RANK
-    return math.exp(min(through, row.log_minus + row.minus * LEAST_RANK))
+    through = row.log_again + row.plus * mix.LEAST_RANK
+    return math.exp(min(through, row.log_minus + row.minus * mix.LEAST_RANK))
 
 
 @inner
@@ -113,7 +113,7 @@ def _enter(row, s, branch):
     if branch == A:
         s.rank, s.snapped, s.rest = -math.inf, 0.0, 1.0
         first = row.log_plus if s.never == 1.0 else row.log_again
-        _end(row, s, True, math.exp(first + row.plus * LEAST_RANK))
+        _end(row, s, True, math.exp(first + row.plus * mix.LEAST_RANK))
         if s.high < mix.LEAST_STRAIN:
             s.branch = SNAP if s.never == 1.0 else AGAIN
             _no_less(row, s, True)
@@ -256,7 +256,7 @@ def evaluate(row, s, eps, x, count, want, out):
     branch = s.branch
     k0, kc, star, n, remembers = row.k0, row.kc, row.star, row.n, row.remembers > 0.0
     p, rest, never, rank, pace, weight = s.snapped, s.rest, s.never, 0.0, 0.0, 0.0
-    moving, first = branch > FIXED, 5 if branch == BACK else 3
+    moving, first = mix.moves(branch), 5 if branch == BACK else 3
     place = row.log_again if branch >= BOTH else row[first]
     wide, on_ever = 1.0 / row[first + 1], 0.0
     by_median = math.exp(-row[first]) if want and moving else 0.0

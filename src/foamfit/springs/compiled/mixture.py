@@ -10,11 +10,11 @@ import math
 from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import inlined, inner
 
-# Branches: A before the first snap, FIXED for a constant snapped fraction, and those above.
-A, FIXED, SNAP, BACK, BOTH, AGAIN = 0, 6, 7, 8, 9, 10
+# Branches: A before the first snap, FIXED for a constant snapped fraction, on the others p changes.
+A, SNAP, FIXED, BACK, BOTH, AGAIN = range(6)
 # The row: k0, kc, eps_star; mean and standard deviation of ln σ at snap-through and snap-back; n;
 # k0 and mean of ln σ of micro-springs that have snapped before; 1 if there is stiffening, softening
-# or weakening; ln of the stress at which both laws of snapping meet (see `law.crossing`).
+# or weakening; ln of the stress at which both laws of snapping meet (see `crossing`).
 ROW = (
     "k0", "kc", "star", "log_plus", "plus", "log_minus", "minus", "n", "worn", "log_again",
     "remembers", "cross",
@@ -35,6 +35,8 @@ LEAST_STRAIN = 1e-14
 # remaining error is about its cube.
 NEAR = 3e-6
 ROUNDED = 1e-8  # largest correction of a share that rounding errors can explain
+# Rank (standard normal score) below which no micro-spring counts as snapped: a fraction of 5e-17.
+LEAST_RANK = -8.3
 LEAST = 2.0**-1022  # least stress of a search: the least normal number
 _HALF, _TURN = math.sqrt(0.5), 1.0 / math.sqrt(2.0 * math.pi)
 
@@ -82,7 +84,7 @@ def stress_on_a(n, k, eps):
 @inner
 def moves(branch):
     """Whether micro-springs snap or snap back on a branch."""
-    return branch > FIXED
+    return branch != A and branch != FIXED
 
 
 @inner
@@ -91,6 +93,18 @@ def line(row, branch):
     if branch == BACK:
         return row.log_minus, row.minus
     return row.log_plus if branch == SNAP else row.log_again, row.plus
+
+
+@inner
+def crossing(log_plus: float, spread_plus: float, log_minus: float, spread_minus: float) -> float:
+    """Return the logarithm of the stress at which one rank snaps through and snaps back.
+
+    The spring is hysteretic (snap-back below snap-through) below this stress if
+    spread_minus >= spread_plus, else above it. It is ±inf if the two laws never meet.
+    """
+    if spread_minus == spread_plus:
+        return math.inf if log_minus < log_plus else -math.inf
+    return log_plus + spread_plus * ((log_plus - log_minus) / (spread_minus - spread_plus))
 
 
 @inner

@@ -16,9 +16,9 @@ from pathlib import Path
 
 from foamfit.errors import InputError
 from foamfit.options import FREED
-from foamfit.springs.laws import bistable, microscale
+from foamfit.springs.laws import bistable, linear, microscale
 from foamfit.springs.laws.bistable import BistableSpring as BistableSpring
-from foamfit.springs.laws.bistable import LinearSpring as LinearSpring
+from foamfit.springs.laws.linear import LinearSpring as LinearSpring
 from foamfit.springs.laws.microscale import MicroscaleSpring as MicroscaleSpring
 from foamfit.springs.laws.record import Functions as Functions
 from foamfit.springs.laws.record import Law as Law
@@ -26,7 +26,7 @@ from foamfit.springs.laws.record import Param as Param
 from foamfit.springs.spring import LawSpring, Relaxation
 
 ENTRY_POINTS = "foamfit.laws"
-_PAPER = (bistable.LAW, bistable.LINEAR_LAW, bistable.UNILATERAL_LAW, microscale.LAW)
+_PAPER = (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)
 _OPTIONAL = (microscale.STIFFENING_LAW, microscale.MULLINS_LAW, microscale.MEMORY_LAW)
 _LAWS = {law.kind: law for law in (*_PAPER, *_OPTIONAL)}
 PAPER = tuple(_LAWS)  # built-in laws

@@ -1,16 +1,15 @@
-"""The springs of the paper: the hysteretic bistable one (eqs. 1-5) and the linear one."""
+"""The hysteretic bistable spring of the paper (eqs. 1-5)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.springs.law import BRANCH_NAMES, derived_points
 from foamfit.springs.laws.record import LAST_STRAIN, Between, Compared, Law, Param, PointOf
 from foamfit.springs.laws.shared import COMPARED_ETA, COMPARED_HEIGHT, COMPARED_K0, K0, KC, steeper
 from foamfit.springs.loop import Loop
@@ -122,6 +121,62 @@ class BistableSpring(Spring):
 def _sigma_a(k0: float, eps_a: float) -> float:
     """Return σ_a = k0 ε_a/(1-ε_a), Pa."""
     return k0 * eps_a / (1.0 - eps_a)
+
+
+# ---------------------------------------------------------------- formulas, which are also compiled
+
+
+def derived_points(
+    k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
+) -> tuple[float, float, float, float, float]:
+    """Return σ_a and σ̄_c (Pa), ε_*, ε̂_a (-inf: e never meets a) and ε̂_c (eqs. 4 and 5).
+
+    Both quadratic equations are written relative to the known end of the branch (C2 for ε̂_c, A1 for
+    ε̂_a), so that their coefficients contain no difference of nearly equal numbers.
+    """
+    sigma_a = k0 * eps_a / (1.0 - eps_a)
+    sigma_c = sigma_a + dsigma
+    eps_star = eps_c - sigma_c / (kc + sigma_c)
+
+    # Eq. 5, c = d. With y = ε - ε_c and u = 1 - (ε_c - ε_*) = kc/(kc + σ̄_c):
+    # u kh+ y² + (kc - u² kh+ + u gap) y - u² gap = 0, one root y >= 0.
+    gap = kh_plus * (eps_c - eps_a) - dsigma
+    u = kc / (kc + sigma_c)
+    b = kc - u * u * kh_plus + u * gap
+    root = math.sqrt(b * b + 4.0 * u * kh_plus * u * u * gap)
+    y = 2.0 * u * u * gap / (b + root) if b >= 0.0 else (root - b) / (2.0 * u * kh_plus)
+
+    # Eq. 4, a = e. With z = ε_a - ε and v = 1 - ε_a:
+    # v kh- z² + (v² kh- + v fall - k0) z + v² fall = 0, the smaller root z >= 0, if any.
+    fall = kh_minus * (eps_c - eps_a) - dsigma
+    v = 1.0 - eps_a
+    b = v * v * kh_minus + v * fall - k0
+    discriminant = b * b - 4.0 * v * kh_minus * v * v * fall
+    if fall == 0.0:
+        eps_hat_a = eps_a
+    elif b < 0.0 and discriminant >= 0.0:
+        eps_hat_a = eps_a - 2.0 * v * v * fall / (math.sqrt(discriminant) - b)
+    else:
+        eps_hat_a = -math.inf
+    return sigma_a, sigma_c, eps_star, eps_hat_a, eps_c + y
+
+
+def admissible(
+    k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
+) -> bool:
+    """Return whether the seven parameters are admissible (docs/theory.md).
+
+    The other conditions follow from these: branch d lies above C2 and branch e below A1.
+    """
+    return (
+        0.0 < k0 < math.inf
+        and 0.0 < kc < math.inf
+        and 0.0 < eps_a < 1.0
+        and eps_a < eps_c < math.inf
+        and -k0 * eps_a / (1.0 - eps_a) < dsigma <= 0.0
+        and 0.0 <= kh_plus < math.inf
+        and 0.0 <= kh_minus < math.inf
+    )
 
 
 # ---------------------------------------------------------------- reading a loop
@@ -297,7 +352,6 @@ LAW = Law(
             "2.34 MPa",
         ),
     ),
-    numbered=BRANCH_NAMES,
     functions="bistable",
     branches={"a": "elastic", "d": "snap-buckling", "c": "densified", "e": "snap-back"},
     spring=BistableSpring,
@@ -339,70 +393,4 @@ LAW = Law(
     inner_loops=False,
     remembers=False,
     published=True,
-)  # fmt: skip
-
-
-# ---------------------------------------------------------------- linear springs
-
-
-@dataclass(frozen=True)
-class LinearSpring(Spring):
-    """The linear spring S1 of the two-spring models, σ = k0 ε, with a dashpot in parallel.
-
-    Parameters
-    ----------
-    k0 : float
-        Slope, Pa.
-    eta : float
-        η, dashpot in parallel, Pa·s.
-    unilateral : bool
-        Whether the spring carries no tension.
-
-    Raises
-    ------
-    ValueError
-        If a parameter is not admissible; the message names it.
-    """
-
-    k0: float
-    eta: float = 0.0
-    unilateral: bool = False
-
-    def __post_init__(self) -> None:
-        """Raise InputError for an inadmissible value; the message names it."""
-        freeze_numbers(self, LINEAR_LAW)
-
-    @property
-    def law(self) -> Law:
-        """The record of its law."""
-        return UNILATERAL_LAW if self.unilateral else LINEAR_LAW
-
-    @property
-    def relaxation(self) -> Relaxation:
-        """Relaxation terms; a linear spring has none."""
-        return ()
-
-
-def _unilateral(k0: float, eta: float = 0.0) -> LinearSpring:
-    return LinearSpring(k0, eta, unilateral=True)
-
-
-LINEAR_LAW = Law(
-    kind="linear",
-    title="linear spring",
-    params=(replace(K0, what="slope", branch="", example="60 MPa"),),
-    numbered=BRANCH_NAMES,
-    functions="linear",
-    branches={"line": "linear"},
-    hysteretic=False,
-    spring=LinearSpring,
-    compared=(COMPARED_K0, COMPARED_ETA, COMPARED_HEIGHT),
-    inner_loops=False,
-    remembers=False,
-    published=True,
-)  # fmt: skip
-UNILATERAL_LAW = replace(
-    LINEAR_LAW, kind="unilateral", title="linear spring without tension", spring=_unilateral,
-    functions="unilateral",
-    branches={"line": "linear", "open": "out of contact"},
 )  # fmt: skip

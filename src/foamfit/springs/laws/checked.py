@@ -93,7 +93,7 @@ def _overrun(law: Law, values: Array) -> str | None:
     own = {name: getattr(one, "py_func", one) for name, one in given._asdict().items() if one}
     p, rate = tuple(values.astype(complex).tolist()), 1.0 + 0j
     for branch, strain, held in product(
-        range(len(law.numbered or law.branches)), (-0.1 + 0j, 0.1 + 0j, 0.4 + 0j), (0.0, 0.1, -0.1)
+        range(len(law.branches)), (-0.1 + 0j, 0.1 + 0j, 0.4 + 0j), (0.0, 0.1, -0.1)
     ):
         x = np.full(law.internal, held, complex)
         at, out = (p, x, strain, branch), np.zeros(law.internal, complex)
@@ -130,7 +130,7 @@ def _trial(law: Law) -> str | None:
         return f"its functions cannot be compiled or run ({type(error).__name__}: {_told(error)})"
     if (at := first_infinite(stress)) is not None:
         return f"the stress is not finite at the strain {TRIED[at]:g} ({shown})"
-    if branches.min() < 0 or branches.max() >= len(law.numbered or law.branches):
+    if branches.min() < 0 or branches.max() >= len(law.branches):
         return f"a branch has the number {branches.max()}, but branches names {len(law.branches)}"
     loading = stress[: _UP.size]
     fall = np.diff(loading) < -FALLS * np.abs(loading).max()

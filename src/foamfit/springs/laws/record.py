@@ -191,7 +191,6 @@ class Law:
     inner_loops: bool = True  #: whether partial unloading leaves the branch
     remembers: bool = True  #: whether its state is more than its branch
     published: bool = False  #: whether the paper has parameters of it
-    numbered: tuple[str, ...] = ()  #: names of branches by number, if not those of `branches`
     #: variants of the law by options of a fit
     options: Mapping[tuple[str, ...], str] = field(default_factory=dict)
     word: str = ""  #: name in models, if it is not `kind`
@@ -265,7 +264,7 @@ class Law:
 
     def named_branch(self, number: int) -> str:
         """Return the name of a branch by its number."""
-        return (self.numbered or tuple(self.branches))[number]
+        return tuple(self.branches)[number]
 
 
 # Parameters of springs of all laws.
