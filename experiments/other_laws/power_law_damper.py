@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 
 import foamfit as ff
+from foamfit.springs import law as formulas
 from foamfit.springs import laws
-from foamfit.springs.laws import bistable as formulas
 
 PAPER = laws.law("bistable")
 points_of = njit(formulas.derived_points)
@@ -82,7 +82,7 @@ LAW = replace(
     ),
     functions=ff.Functions(stress, ends=ends, switch=switch, viscous=viscous,
                            admissible=admissible),
-    numbered=tuple("adce"), spring=None, published=False, searched=(*PAPER.searched, "c", "n"),
+    spring=None, published=False, searched=(*PAPER.searched, "c", "n"),
     read_off=read_off, read_in_series=None, marks=7, neighbours=lambda values, top: iter(()),
     exchanged=None, points=(), compared=(),
 )  # fmt: skip

@@ -79,7 +79,7 @@ def copy(internal: int) -> Law:
     given = (_smeared, _still) if internal else (power_law_damper.stress,)
     ends = {"ends": power_law_damper.ends, "switch": power_law_damper.switch}
     functions = ff.Functions(*given, **ends)
-    copied = {"kind": f"copy-{internal}", "spring": None, "numbered": tuple("adce")}
+    copied = {"kind": f"copy-{internal}", "spring": None}
     return laws.register(
         dataclasses.replace(
             laws.bistable.LAW, functions=functions, internal=internal, options={}, **copied

@@ -29,7 +29,7 @@ from foamfit.report.render import sentences, words
 from foamfit.report.studies.parameters import Panel, plot_parameters
 from foamfit.results import Fit
 from foamfit.springs.laws import law
-from foamfit.springs.laws.record import ETA, RELAXATION_TIME, STRENGTH, Compared
+from foamfit.springs.laws.record import COMMON, ETA, HEIGHT, RELAXATION_TIME, STRENGTH, Compared
 from foamfit.springs.model import Model
 from foamfit.springs.published import PublishedSet
 from foamfit.springs.published import published as published_sets
@@ -241,17 +241,20 @@ def _total(*parts: Any) -> Any:
     return sum(parts)
 
 
+_UNITS = {"Pa": (1e6, "MPa"), "Pa s": (1.0, "Pa·s"), "m": (1e-3, "mm")}
 DAMPING = Compared("η", "Pa·s", (), _total)  # of the striker's motion
 
 
 def _quantities(kind: str, relaxation: int) -> Iterator[Compared]:
     """Yield the compared quantities of a law: those of its record, or else each parameter."""
     own, hysteretic = law(kind), law(kind).hysteretic
-    for param in () if own.compared else own.params:
-        factor, unit = (1e6, "MPa") if param.unit == "Pa" else (1.0, param.unit)
-        label = "_".join(filter(None, param.symbol)) or param.name
-        yield Compared(label, unit, (param.name,), lambda value, factor=factor: value / factor)
-    yield from own.compared
+    for row in own.compared or (*own.own, ETA.name, HEIGHT.name):
+        if isinstance(row, Compared):
+            yield row
+            continue
+        param = COMMON.get(row) or own.by_name[row]
+        factor, unit = _UNITS.get(param.unit, (1.0, param.unit))
+        yield Compared(param.label, unit, (row,), lambda value, factor=factor: value / factor)
     for k, param in itertools.product(range(1, relaxation + 1), (STRENGTH, RELAXATION_TIME)):
         if hysteretic:
             yield Compared(f"{param.symbol[0]}_{k}", param.unit, (f"{param.name}{k}",), _total)

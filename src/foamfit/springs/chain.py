@@ -39,7 +39,7 @@ def _listed(values: Any, name: str, wanted: str) -> tuple[Any, ...]:
 class ChainArrays(NamedTuple):
     """A chain in the form that the solver uses.
 
-    rows (n_springs, columns) are the springs (`compiled.solver_row`), padded with zeros; heights
+    rows (n_springs, columns) are the springs (`compiled.fill_row`), padded with zeros; heights
     (m) are (n_springs,). `ends` are one past the last spring below each interior mass and the top,
     `inside` the interior masses over the area (kg/m²), `damped` whether there are dashpots,
     `steep` the sum of the heights times the steepest slopes at zero stress (Pa·m).

@@ -49,24 +49,22 @@ def as_samples(values: ArrayLike, name: str) -> Array:
     raise InputError(f"{name} must be an array of numbers")
 
 
-def freeze_numbers(spring: Any, law: Law) -> None:
-    """Convert the parameters of a spring to floats; InputError if they are not admissible."""
+def freeze(spring: Any, law: Law, relaxation: Any = ()) -> None:
+    """Convert parameters to floats and relaxation terms to pairs of floats.
+
+    InputError if one is not admissible; a parameter with coordinate `Between` need only be finite.
+    """
     from foamfit.springs.laws.record import ADMISSIBLE
 
-    for name in law.names:
+    put = object.__setattr__
+    for name, param in law.by_name.items():
         value = as_number(getattr(spring, name), name)
         require(math.isfinite(value), name, value, "finite")
-        object.__setattr__(spring, name, value)
-    for name, param in law.by_name.items():
-        if not param.of:  # else the law checks it together with other parameters
-            value, wanted = getattr(spring, name), param.admissible
-            require(ADMISSIBLE[wanted](value), name, value, wanted)
-
-
-def freeze_terms(spring: object, given: Any) -> None:
-    """Convert relaxation terms to pairs of floats; InputError if they are not admissible."""
+        if not param.of:
+            require(ADMISSIBLE[param.admissible](value), name, value, param.admissible)
+        put(spring, name, value)
     try:
-        pairs = [(g, tau) for g, tau in given]
+        pairs = [(g, tau) for g, tau in relaxation]
     except (TypeError, ValueError):
         raise InputError("relaxation must be a sequence of pairs (g, tau in s)") from None
     terms = []
@@ -75,7 +73,8 @@ def freeze_terms(spring: object, given: Any) -> None:
         require(0 <= g < math.inf, f"g{k}", g, "finite and zero or positive")
         require(0 < tau < math.inf, f"tau{k}", tau, "finite and positive")
         terms.append((g, tau))
-    object.__setattr__(spring, "relaxation", tuple(terms))
+    if law.hysteretic:
+        put(spring, "relaxation", tuple(terms))
 
 
 def first_infinite(values: Array) -> int | None:
@@ -112,12 +111,15 @@ class Spring(ABC):
         return self.solver_row(0)
 
     def solver_row(self, room: int) -> Array:
-        """Return the row with `room` relaxation terms."""
-        from foamfit.springs.compiled import solver_row
+        """Return the row with `room` relaxation terms; InputError if the law refuses the values."""
+        from foamfit.springs.compiled import compiled, fill_row
 
-        terms = self.relaxation if room else ()
-        row = solver_row(self.law, np.array(self.values), terms, room)
-        assert row is not None  # checked when the spring was made
+        made, values = compiled(self.law), np.array(self.values)
+        row, terms = np.zeros(1 + 2 * room + made.columns), self.relaxation if room else ()
+        if not fill_row(made, values, np.ravel(terms), room, row):
+            named = zip(self.law.names, self.values, strict=True)
+            given = ", ".join(f"{name} = {value:g}" for name, value in named)
+            raise InputError(f"{given} is not admissible: the law '{self.law.kind}' refuses it")
         return row
 
     @property
@@ -225,18 +227,13 @@ class LawSpring(Spring):
 
     def __init__(self, law: Law, values: Sequence[float], relaxation: Relaxation = ()) -> None:
         """Check the arguments and make the spring immutable."""
-        from foamfit.springs.compiled import solver_row
-
         put = object.__setattr__
         put(self, "record", law)
         for name, value in zip(law.names, values, strict=True):
             put(self, name, value)
-        freeze_numbers(self, law)
-        freeze_terms(self, relaxation)
-        put(self, "numbers", tuple(getattr(self, name) for name in law.names))
-        if solver_row(law, np.array(self.numbers)) is None:
-            given = ", ".join(f"{n} = {v:g}" for n, v in zip(law.names, self.numbers, strict=True))
-            raise InputError(f"{given} is not admissible: the law '{law.kind}' refuses it")
+        freeze(self, law, relaxation)
+        put(self, "numbers", self.values)
+        assert self.row is not None  # which the law may refuse
 
     @property
     def law(self) -> Law:

@@ -198,7 +198,7 @@ def _inner_loops(best: BestPoint) -> dict[str, Any] | None:
     """Return the share of partial unloadings in the residuals of laws without inner loops."""
     test, curve = best.problem.measurement, best.simulated.curves.get("stress_strain")
     hysteretic = [law for law in best.problem.model.laws if law.hysteretic]
-    if not hysteretic or curve is None or any(law.inner_loops for law in hysteretic):
+    if not hysteretic or curve is None or any(law.remembers for law in hysteretic):
         return None
     assert test.displacement is not None
     assert test.stress is not None
@@ -212,7 +212,7 @@ def _inner_loops(best: BestPoint) -> dict[str, Any] | None:
         spans.append(f"from {start} to {end}")
     if not spans or not (total := float(squares.sum())) > 0.0:
         return None
-    with_loops = [law for law in map(laws.law, laws.kinds()) if law.inner_loops]
+    with_loops = [law for law in map(laws.law, laws.kinds()) if law.remembers]
     groups = (hysteretic, with_loops)
     without, others = (listed(dict.fromkeys(f"{law.title}s" for law in group)) for group in groups)
     shares = {"samples": float(inside.mean()), "squares": float(squares[inside].sum()) / total}
@@ -250,7 +250,7 @@ def _is_closed(best: BestPoint) -> bool:
     motion, laws = best.simulated.motion, best.problem.model.laws
     own = np.diff(motion.displacement, axis=0, prepend=0.0)  # compression of each spring
     loops = [np.abs(np.trapezoid(motion.base_stress, w)) / np.ptp(w) for w in own]
-    kept = [law.hysteretic and not law.inner_loops for law in laws]
+    kept = [law.hysteretic and not law.remembers for law in laws]
     return any(np.array(loops)[kept] < CLOSED * motion.base_stress.max())
 
 

@@ -13,7 +13,7 @@ from numba import njit
 
 from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import BY, MISS, OF_LAW, SLOPE, Compiled, inner, past, start
-from foamfit.springs.laws.bistable import admissible, derived_points
+from foamfit.springs.law import admissible, derived_points
 
 A, D, C, E = range(4)  # branches of a bistable spring
 LINE, OPEN = range(2)  # of a linear one; OPEN: out of contact

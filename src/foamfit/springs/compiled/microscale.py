@@ -26,7 +26,7 @@ from foamfit.springs.compiled import contract
 from foamfit.springs.compiled import mixture as mix
 from foamfit.springs.compiled.contract import BY, BY_HELD, MISS, OF_LAW, SLOPE, inner, past, start
 from foamfit.springs.compiled.mixture import AGAIN, BACK, BOTH, FIXED, SNAP, A, at_stress, shares
-from foamfit.springs.laws.microscale import most_beyond
+from foamfit.springs.law import most_beyond
 
 _most_beyond = inner(most_beyond)
 
@@ -71,9 +71,7 @@ def _put_end(s, high, eps, sigma):
 @inner
 def _end(row, s, high, sigma):
     """Set the upper (`high`) or lower end of the branch to a stress, not behind the spring."""
-    soft, bend = s.flexibility, s.curvature
-    eps = at_stress(row, s, sigma)
-    s.flexibility, s.curvature = soft, bend
+    eps, _, _ = at_stress(row, s, sigma)
     behind = eps < s.eps if high else eps > s.eps
     _put_end(s, high, s.eps if behind else eps, s.x if behind else sigma)
 
@@ -245,8 +243,8 @@ def settle(row, s, eps):
 @contract.inverting
 def strain(row, s, sigma):
     row, s = mix.as_row(row), mix.as_microscale(s)
-    eps = at_stress(row, s, sigma)
-    s.soft = s.flexibility
+    eps, s.soft, s.curvature = at_stress(row, s, sigma)
+    s.flexibility = s.soft
     return eps
 
 

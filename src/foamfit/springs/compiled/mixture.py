@@ -131,13 +131,12 @@ def mixture(row, branch, p, rest, never, sigma):
 
 @inner
 def at_stress(row, s, sigma):
-    """Return the strain at a stress on the branch; fill dε/dσ and d²ε/dσ²."""
+    """Return the strain at a stress on the branch, dε/dσ and d²ε/dσ²."""
     branch = int(s.branch)
     if not moves(branch) or not sigma > 0.0:  # where none has snapped, branches are continued
         p, rest = (0.0, 1.0) if moves(branch) else (s.snapped, s.rest)
         strain, slope, bend, _, _ = mixture(row, branch, p, rest, s.never, sigma)
-        s.flexibility, s.curvature = slope, bend
-        return strain
+        return strain, slope, bend
     place, scale = line(row, branch)
     rank = (math.log(sigma) - place) / scale
     p, rest = shares(rank)
@@ -146,8 +145,7 @@ def at_stress(row, s, sigma):
     gap, rate = row.star + sigma * two - one, density(rank) / (scale * sigma)
     bend += 2.0 * rate * (row.kc * two * two - on_one)
     bend -= rate * gap * (rank / scale + 1.0) / sigma
-    s.flexibility, s.curvature = slope + rate * gap, bend
-    return strain
+    return strain, slope + rate * gap, bend
 
 
 @inner
@@ -214,15 +212,15 @@ def stress_in(row, s, eps):
         sigma += step * (1.0 - 0.5 * step * s.curvature / slope)
     narrow = min(row.plus, row.minus, 1.0) if moves(branch) else 1.0
     for _ in range(300):
-        miss = at_stress(row, s, sigma) - eps
-        slope, bend = s.flexibility, s.curvature
+        reached, slope, bend = at_stress(row, s, sigma)
+        miss = reached - eps
         step = miss / slope
         part = 1.0 - 0.5 * step * bend / slope
         if 0.5 < part < 2.0:
             step /= part
         new = sigma - step
         if abs(step) <= NEAR * abs(sigma) * narrow and low <= new <= high:
-            s.flexibility += bend * (new - sigma)
+            s.flexibility, s.curvature = slope + bend * (new - sigma), bend
             return new
         if not bounded:  # the initial guess did not suffice
             low, high = _ends_of_stress(row, s, eps)

@@ -9,7 +9,6 @@ import copyreg
 import importlib.util
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -23,7 +22,6 @@ from foamfit.springs.laws.microscale import MicroscaleSpring as MicroscaleSpring
 from foamfit.springs.laws.record import Functions as Functions
 from foamfit.springs.laws.record import Law as Law
 from foamfit.springs.laws.record import Param as Param
-from foamfit.springs.spring import LawSpring, Relaxation
 
 ENTRY_POINTS = "foamfit.laws"
 _PAPER = (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)
@@ -95,14 +93,7 @@ def register(law: Law) -> Law:
     """
     from foamfit.springs.laws.checked import check
 
-    known = law
-    if isinstance(law, Law) and law.spring is None:
-
-        def make(*values: float, relaxation: Relaxation = ()) -> LawSpring:
-            return LawSpring(known, values, relaxation)
-
-        known = replace(law, spring=make)
-    check(known, (*PAPER, "auto"))  # its functions stay compiled for the springs that `make` makes
+    known = check(law, (*PAPER, "auto"))  # its functions stay compiled for its springs
     _LAWS[known.kind] = known
     return known
 

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.springs.law import derived_points
 from foamfit.springs.laws.record import LAST_STRAIN, Between, Compared, Law, Param, PointOf
-from foamfit.springs.laws.shared import COMPARED_ETA, COMPARED_HEIGHT, COMPARED_K0, K0, KC, steeper
+from foamfit.springs.laws.shared import K0, KC, steeper
 from foamfit.springs.loop import Loop
-from foamfit.springs.spring import Relaxation, Spring, freeze_numbers, freeze_terms, require
+from foamfit.springs.spring import Relaxation, Spring, freeze, require
 
 
 def _point(place: int, what: str) -> Any:
@@ -70,8 +71,7 @@ class BistableSpring(Spring):
 
     def __post_init__(self) -> None:
         """Raise InputError for an inadmissible value; the message names it."""
-        freeze_numbers(self, LAW)
-        freeze_terms(self, self.relaxation)
+        freeze(self, LAW, self.relaxation)
         past = f"greater than eps_a = {self.eps_a:g}"
         require(self.eps_c > self.eps_a, "eps_c", self.eps_c, past)
         least = -_sigma_a(self.k0, self.eps_a)
@@ -121,62 +121,6 @@ class BistableSpring(Spring):
 def _sigma_a(k0: float, eps_a: float) -> float:
     """Return σ_a = k0 ε_a/(1-ε_a), Pa."""
     return k0 * eps_a / (1.0 - eps_a)
-
-
-# ---------------------------------------------------------------- formulas, which are also compiled
-
-
-def derived_points(
-    k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
-) -> tuple[float, float, float, float, float]:
-    """Return σ_a and σ̄_c (Pa), ε_*, ε̂_a (-inf: e never meets a) and ε̂_c (eqs. 4 and 5).
-
-    Both quadratic equations are written relative to the known end of the branch (C2 for ε̂_c, A1 for
-    ε̂_a), so that their coefficients contain no difference of nearly equal numbers.
-    """
-    sigma_a = k0 * eps_a / (1.0 - eps_a)
-    sigma_c = sigma_a + dsigma
-    eps_star = eps_c - sigma_c / (kc + sigma_c)
-
-    # Eq. 5, c = d. With y = ε - ε_c and u = 1 - (ε_c - ε_*) = kc/(kc + σ̄_c):
-    # u kh+ y² + (kc - u² kh+ + u gap) y - u² gap = 0, one root y >= 0.
-    gap = kh_plus * (eps_c - eps_a) - dsigma
-    u = kc / (kc + sigma_c)
-    b = kc - u * u * kh_plus + u * gap
-    root = math.sqrt(b * b + 4.0 * u * kh_plus * u * u * gap)
-    y = 2.0 * u * u * gap / (b + root) if b >= 0.0 else (root - b) / (2.0 * u * kh_plus)
-
-    # Eq. 4, a = e. With z = ε_a - ε and v = 1 - ε_a:
-    # v kh- z² + (v² kh- + v fall - k0) z + v² fall = 0, the smaller root z >= 0, if any.
-    fall = kh_minus * (eps_c - eps_a) - dsigma
-    v = 1.0 - eps_a
-    b = v * v * kh_minus + v * fall - k0
-    discriminant = b * b - 4.0 * v * kh_minus * v * v * fall
-    if fall == 0.0:
-        eps_hat_a = eps_a
-    elif b < 0.0 and discriminant >= 0.0:
-        eps_hat_a = eps_a - 2.0 * v * v * fall / (math.sqrt(discriminant) - b)
-    else:
-        eps_hat_a = -math.inf
-    return sigma_a, sigma_c, eps_star, eps_hat_a, eps_c + y
-
-
-def admissible(
-    k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
-) -> bool:
-    """Return whether the seven parameters are admissible (docs/theory.md).
-
-    The other conditions follow from these: branch d lies above C2 and branch e below A1.
-    """
-    return (
-        0.0 < k0 < math.inf
-        and 0.0 < kc < math.inf
-        and 0.0 < eps_a < 1.0
-        and eps_a < eps_c < math.inf
-        and -k0 * eps_a / (1.0 - eps_a) < dsigma <= 0.0
-        and 0.0 <= kh_plus < math.inf
-        and 0.0 <= kh_minus < math.inf
-    )
 
 
 # ---------------------------------------------------------------- reading a loop
@@ -352,7 +296,7 @@ LAW = Law(
             "2.34 MPa",
         ),
     ),
-    functions="bistable",
+    functions="bistable.COMPILED",
     branches={"a": "elastic", "d": "snap-buckling", "c": "densified", "e": "snap-back"},
     spring=BistableSpring,
     searched=("k0", "kc", "eps_a", "eps_c", "dsigma", "kh_plus", "kh_minus"),
@@ -375,22 +319,18 @@ LAW = Law(
         PointOf("sigma_hat_c", ("σ̂", "c"), "stress at C1", "Pa"),
     ),
     compared=(
-        COMPARED_K0,
+        "k0",
         Compared(
             "Δσ/σ_a", "", ("dsigma", "k0", "eps_a"),
             lambda dsigma, k0, eps_a: dsigma * (1.0 - eps_a) / (k0 * eps_a),
         ),
-        COMPARED_ETA,
-        Compared("ε_a", "", ("eps_a",), lambda eps_a: eps_a),
-        Compared("ε_c", "", ("eps_c",), lambda eps_c: eps_c),
-        COMPARED_HEIGHT,
+        *("eta", "eps_a", "eps_c", "height"),
         Compared("k_h+/k0", "", ("kh_plus", "k0"), lambda slope, k0: slope / k0),
         Compared("k_h−/k0", "", ("kh_minus", "k0"), lambda slope, k0: slope / k0),
         Compared("k_c/k0", "", ("kc", "k0"), lambda kc, k0: kc / k0),
     ),
     note="A1 and C1 are where the spring starts to snap and has snapped on loading; C2 and A2 "
     "where it starts to snap back and has recovered on unloading.",
-    inner_loops=False,
     remembers=False,
     published=True,
 )  # fmt: skip

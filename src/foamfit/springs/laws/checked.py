@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -12,12 +13,10 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.solve.histories import stress_along
-from foamfit.springs.compiled import solver_row
 from foamfit.springs.compiled.contract import MOST_INTERNAL
-from foamfit.springs.laws.record import ADMISSIBLE, COMMON, Functions, Law, Param
+from foamfit.springs.laws.record import ADMISSIBLE, COMMON, SCALES, Functions, Law, Param
 from foamfit.springs.spring import LawSpring, first_infinite
 
-SCALES = {"one": 1.0, "strain": 0.5, "stress": 1e6, "slope": 2e6, "damping": 1e3, "duration": 1e-3}
 _UP = np.linspace(0.0, 0.5, 101)
 TRIED = np.concatenate([_UP, _UP[-2::-1]])  # strains of the trial: loading and unloading
 FALLS = 1e-9  # allowed decrease of stress on loading (rounding), relative to the largest stress
@@ -54,11 +53,6 @@ def _param(law: Law, param: Param) -> str | None:
     if unknown := [name for name in param.of if name not in law.own]:
         return f"its coordinate is relative to '{unknown[0]}', which the law does not have"
     return None
-
-
-def start_values(law: Law) -> Array:
-    """Return the start values of the parameters for a test of 1 MPa at a strain of 0.5."""
-    return law.assembled(lambda param: 0.5 if param.of else param.start[0] * SCALES[param.start[1]])
 
 
 def _missing(law: Law) -> str | None:
@@ -118,14 +112,14 @@ def _overrun(law: Law, values: Array) -> str | None:
 
 def _trial(law: Law) -> str | None:
     """Return what is wrong in a loading and unloading at start values, or None."""
-    values = start_values(law)
+    values = law.start_values
     if (wrong := _overrun(law, values)) is not None:
         return wrong
     shown = ", ".join(f"{n} = {v:g}" for n, v in zip(law.own, values, strict=True))
     try:
-        if solver_row(law, np.append(values, 0.0)) is None:
-            return f"admissible refuses its own start values ({shown}); give others"
         stress, branches = stress_along(law, LawSpring(law, [*values, 0.0]).row, TRIED)
+    except InputError:
+        return f"admissible refuses its own start values ({shown}); give others"
     except Exception as error:  # any error of the compiler in a user's function
         return f"its functions cannot be compiled or run ({type(error).__name__}: {_told(error)})"
     if (at := first_infinite(stress)) is not None:
@@ -148,10 +142,13 @@ def _told(error: Exception) -> str:
     return " ".join(re.sub("\x1b\\[[0-9;]*m", "", str(error)).split())[:300]
 
 
-def check(law: Law, taken: Sequence[str]) -> None:
-    """Raise InputError if a law is wrong; `taken` are the names of built-in laws."""
+def check(law: Law, taken: Sequence[str]) -> Law:
+    """Return the law with a way to make springs; InputError if it is wrong or its name `taken`."""
     if not isinstance(law, Law):
         raise InputError(f"{law!r} is not a foamfit.Law")
+    if law.spring is None:
+        law = replace(law, spring=lambda *given, **terms: LawSpring(law, given, **terms))
     wrong = _names(law, taken) or _missing(law) or _trial(law)
     if wrong:
         raise InputError(f"law '{law.kind}': {wrong}")
+    return law

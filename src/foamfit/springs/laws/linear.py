@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from foamfit.springs.laws.record import Law
-from foamfit.springs.laws.shared import COMPARED_ETA, COMPARED_HEIGHT, COMPARED_K0, K0
-from foamfit.springs.spring import Relaxation, Spring, freeze_numbers
+from foamfit.springs.laws.shared import K0
+from foamfit.springs.spring import Relaxation, Spring, freeze
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class LinearSpring(Spring):
 
     def __post_init__(self) -> None:
         """Raise InputError for an inadmissible value; the message names it."""
-        freeze_numbers(self, LAW)
+        freeze(self, LAW)
 
     @property
     def law(self) -> Law:
@@ -55,17 +55,15 @@ LAW = Law(
     kind="linear",
     title="linear spring",
     params=(replace(K0, what="slope", branch="", example="60 MPa"),),
-    functions="linear",
+    functions="bistable.LINEAR",
     branches={"line": "linear"},
     hysteretic=False,
     spring=LinearSpring,
-    compared=(COMPARED_K0, COMPARED_ETA, COMPARED_HEIGHT),
-    inner_loops=False,
     remembers=False,
     published=True,
 )  # fmt: skip
 UNILATERAL_LAW = replace(
     LAW, kind="unilateral", title="linear spring without tension", spring=_unilateral,
-    functions="unilateral",
+    functions="bistable.UNILATERAL",
     branches={"line": "linear", "open": "out of contact"},
 )  # fmt: skip

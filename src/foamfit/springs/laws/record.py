@@ -20,13 +20,14 @@ from foamfit.errors import InputError
 from foamfit.springs.loop import Loop
 
 LAST_STRAIN = 0.999
+# What the scales of a test are without one: 1 MPa at a strain of 0.5 within 1 ms.
+SCALES = {"one": 1.0, "strain": 0.5, "stress": 1e6, "slope": 2e6, "damping": 1e3, "duration": 1e-3}
 # Directions of derivatives, beside the places of parameters in their law: dashpot, height, onsite
 # damper, and from OWN_RELAXATION on g and τ of each relaxation term. The others are those of a
 # drive: a shift of the prescribed motion of all samples in contact; of an impact its time of
 # contact, velocity, and areal mass of the striker, kg/m².
 OWN_ETA, OWN_HEIGHT, DRAG, OWN_RELAXATION = range(1_000_000, 1_000_004)
 MOVED, BEGUN, STRUCK, HEAVIER = range(-4, 0)
-
 # Conditions on the value of a parameter, by their wording in messages.
 ADMISSIBLE: dict[str, Callable[[float], bool]] = {
     "positive": lambda value: value > 0.0,
@@ -74,6 +75,14 @@ class Param:
     branch: str = ""  #: branch that a test must reach to determine the parameter
     moves: str = ""  #: another branch, which it moves together with other parameters
     example: str = ""  #: a value with its unit, as in a file
+
+    @property
+    def label(self) -> str:
+        """The symbol in plain text: k0, k_c, σ₊."""
+        letter, index = self.symbol
+        if index.strip("0+−"):
+            return f"{letter}_{index}"
+        return letter + index.translate(str.maketrans("+−", "₊₋")) or self.name
 
     @property
     def is_logarithmic(self) -> bool:
@@ -186,10 +195,11 @@ class Law:
     #: (values, height) to the stresses and elongations that springs exchange, and back
     exchanged: tuple[Callable[[Array, float], Array], Callable[[Array, float], Array]] | None = None
     points: tuple[PointOf, ...] = ()  #: derived numbers in the report
-    compared: tuple[Compared, ...] = ()  #: rows of a comparison
+    #: rows of a comparison, or names of parameters; by default all parameters
+    compared: tuple[Compared | str, ...] = ()
     note: str = ""  #: sentence of the report on the marks of the figure
-    inner_loops: bool = True  #: whether partial unloading leaves the branch
-    remembers: bool = True  #: whether its state is more than its branch
+    #: whether its state is more than its branch, so that partial unloading leaves the branch
+    remembers: bool = True
     published: bool = False  #: whether the paper has parameters of it
     #: variants of the law by options of a fit
     options: Mapping[tuple[str, ...], str] = field(default_factory=dict)
@@ -254,9 +264,13 @@ class Law:
         return np.array([values[name] for name in self.own])
 
     def any_spring(self, terms: int = 0) -> Any:
-        """Return a spring of the law with arbitrary parameters and relaxation terms."""
-        own = self.assembled(lambda param: 0.2 if param.of else abs(param.start[0]) or 1.0)
-        return self.make([*own, 0.0], ((0.0, 1.0),) * terms)
+        """Return a spring with the start values of the parameters, and relaxation terms."""
+        return self.make([*self.start_values, 0.0], ((0.0, 1.0),) * terms)
+
+    @property
+    def start_values(self) -> Array:
+        """The start values of the parameters where no test gives a scale, see `SCALES`."""
+        return self.assembled(lambda p: 0.5 if p.of else p.start[0] * SCALES[p.start[1]])
 
     def derivative(self, short: str) -> int:
         """Return the index of the derivative by a parameter."""

@@ -1,4 +1,4 @@
-"""Shared parts of the built-in laws: stiffnesses, comparison, start points with other k_c."""
+"""Shared parts of the built-in laws: stiffnesses, start points with other k_c."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.springs.laws.record import Compared, Param
+from foamfit.springs.laws.record import Param
 
 _INNER = (math.log(0.3), math.log(300.0))  # of stiffness divided by largest stress
 K0 = Param(
@@ -19,9 +19,6 @@ KC = Param(
     "kc", ("k", "c"), "Pa", "first slope of branch c", (20.0, "slope"), (1e-2, 1e5), "stress",
     inner=_INNER, branch="c", example="82.5 MPa",
 )  # fmt: skip
-COMPARED_K0 = Compared("k0", "MPa", ("k0",), lambda k0: k0 / 1e6)
-COMPARED_ETA = Compared("η", "Pa·s", ("eta",), lambda eta: eta)
-COMPARED_HEIGHT = Compared("h", "mm", ("height",), lambda height: height / 1e-3)
 # k_c of further start points, divided by the largest stress.
 STEEP = np.geomspace(1.0, 1000.0, 7)
 
