@@ -154,9 +154,8 @@ def test_springs_under_a_known_elongation_carry_one_stress(
         return miss
 
     monkeypatch.setattr(static, "balance", kept)
-    stress = ff.simulate(
-        chain, ff.DisplacementDrive(TO_AND_FRO), np.arange(float(TO_AND_FRO.size))
-    ).base_stress
+    drive, time = ff.DisplacementDrive(TO_AND_FRO), np.arange(float(TO_AND_FRO.size))
+    stress = ff.simulate(chain, drive, time).base_stress
     (strain, branches), heights = found, chain.arrays.heights
     assert np.abs(heights @ strain - TO_AND_FRO).max() <= 1e-13 * HEIGHT
     for spring, own in zip(chain.springs, strain, strict=True):

@@ -116,7 +116,7 @@ def test_a_spring_does_not_load_what_was_compiled_of_another_source(tmp_path: Pa
         folder.mkdir()
         for path in Path(stored.stats.cache_path).glob("*.nb[ci]"):
             shutil.copy2(path, folder)
-    files = [*tmp_path.rglob("bistable.strain_linear-*"), *tmp_path.rglob("samples.sample_task-*")]
+    files = [*tmp_path.rglob("bistable.strain-*"), *tmp_path.rglob("samples.sample_task-*")]
     assert len({path.parent for path in files}) == 2
     for path in files:
         path.write_bytes(b"of another source")

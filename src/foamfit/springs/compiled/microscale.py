@@ -50,7 +50,7 @@ def fill(values, array):
     row.log_plus, row.plus = math.log(values[3]), values[4]
     row.log_minus, row.minus, row.n = math.log(values[5]), values[6], n
     row.worn, row.log_again = row.k0 * math.exp(-softening), row.log_plus - weakening
-    row.remembers = 1.0 if count > 7 else 0.0
+    row.remembers = 0.0 if count == 7 else 1.0 if count == 9 else 2.0
     row.cross = mix.crossing(row.log_again, row.plus, row.log_minus, row.minus)
     least, _ = _most_beyond(row.worn, row.kc, n)
     return row.worn > 0.0 and row.star >= least
@@ -80,9 +80,8 @@ def _end(row, s, high, sigma):
 def _no_less(row, s, high):
     """Raise an end of the branch to the least strain at which a micro-spring may snap."""
     if (s.high if high else s.low) < mix.LEAST_STRAIN:
-        soft, bend = s.flexibility, s.curvature
         _put_end(s, high, mix.LEAST_STRAIN, mix.stress_in(row, s, mix.LEAST_STRAIN))
-        s.flexibility, s.curvature = soft, bend
+        s.flexibility = 0.0  # it is not that of the present stress
 
 
 @inner
@@ -305,6 +304,8 @@ def evaluate(row, s, eps, x, count, want, out):
         else:
             held[0] = -slope * by_rank
         if remembers:
+            if n == 1.0 and row.remembers > 1.0:
+                by_n, by_n_one = mix.by_stiffening(k0, sigma), mix.by_stiffening(row.worn, sigma)
             by[mix.STIFFENING * count] = -slope * (fresh * by_n + worn * by_n_one)
             by[mix.SOFTENING * count] = -slope * worn * sigma * soft_one
             held[count] = -slope * on_ever * (one - main)

@@ -13,8 +13,8 @@ from foamfit.springs.compiled.contract import inlined, inner
 # Branches: A before the first snap, FIXED for a constant snapped fraction, on the others p changes.
 A, SNAP, FIXED, BACK, BOTH, AGAIN = range(6)
 # The row: k0, kc, eps_star; mean and standard deviation of ln σ at snap-through and snap-back; n;
-# k0 and mean of ln σ of micro-springs that have snapped before; 1 if there is stiffening, softening
-# or weakening; ln of the stress at which both laws of snapping meet (see `crossing`).
+# k0 and mean of ln σ of micro-springs that have snapped before; 2 if n is a parameter, else 1 if
+# there is softening or weakening; ln of the stress where both laws of snapping meet (`crossing`).
 ROW = (
     "k0", "kc", "star", "log_plus", "plus", "log_minus", "minus", "n", "worn", "log_again",
     "remembers", "cross",
@@ -56,21 +56,28 @@ def density(rank):
 
 @inlined
 def on_a(n, k, sigma):
-    """Return strain a(σ; k) (-inf past its pole) and its derivatives by σ, σ twice, and n."""
-    if n == 1.0:
-        one = 1.0 / (k + sigma)
-        slope = k * one * one
-        if not sigma > -k:
-            return -math.inf, 0.0, 0.0, 0.0
-        by_n = 0.0
-        return sigma * one, slope, -2.0 * slope * one, by_n
+    """Return strain a(σ; k) (-inf past its pole) and its derivatives by σ, σ twice, and n.
+
+    That by n = 1, which few need, is left at zero; see `by_stiffening`.
+    """
     above = k + n * sigma
     if not above > 0.0:
         return -math.inf, 0.0, 0.0, 0.0
+    per = 1.0 / above
+    if n == 1.0:
+        slope, by_n = k * per * per, 0.0
+        return sigma * per, slope, -2.0 * slope * per, by_n
     log = math.log1p(n * sigma / k) / n
-    left, per = math.exp(-log), 1.0 / above
+    left = math.exp(-log)
     slope = left * per
     return -math.expm1(-log), slope, -(1.0 + n) * slope * per, left * (sigma * per - log) / n
+
+
+@inlined
+def by_stiffening(k, sigma):
+    """Return the derivative of a(σ; k) by n at n = 1."""
+    per = 1.0 / (k + sigma)
+    return k * per * (sigma * per - math.log1p(sigma / k))
 
 
 @inner
