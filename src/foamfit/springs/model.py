@@ -22,8 +22,8 @@ from foamfit.options import FREED, MOST_TERMS
 from foamfit.springs import laws
 from foamfit.springs.chain import Chain
 from foamfit.springs.compiled import compiled, fill_row
-from foamfit.springs.laws.record import Law, Param
-from foamfit.springs.parameters import direction, names_of, param_of
+from foamfit.springs.laws.record import COMMON, Law, Param
+from foamfit.springs.parameters import direction, family, names_of, split_name
 from foamfit.springs.spring import Spring
 
 if TYPE_CHECKING:
@@ -105,7 +105,8 @@ class Model:
 
     def param(self, name: str) -> Param:
         """Return the record of a parameter."""
-        return param_of(self.kinds, name)
+        spring, short = split_name(name)
+        return COMMON.get(family(short)) or self.laws[spring].by_name[short]
 
     @cached_property
     def own_places(self) -> tuple[int, ...]:

@@ -47,7 +47,7 @@ def springs_first(names: Iterable[str]) -> list[str]:
 def split_name(name: str) -> tuple[int, str]:
     """Split "s2_kh_plus" into (1, "kh_plus"); (-1, "eta") for "site_eta", (-1, "velocity")."""
     prefix, _, short = name.partition("_")
-    if prefix.startswith("s") and prefix[1:].isdigit():
+    if prefix.startswith("s") and prefix[1:].isdecimal():
         return int(prefix[1:]) - 1, short
     return -1, name.removeprefix("site_")
 
@@ -58,13 +58,6 @@ def family(short: str) -> str:
         if short.startswith(name) and short.removeprefix(name).isdigit():
             return name
     return short
-
-
-def param_of(kinds: tuple[str, ...], name: str) -> Param:
-    """Return the record of a parameter ("s1_k0", "s2_height") of springs of these kinds."""
-    spring, short = split_name(name)
-    common = COMMON.get(family(short))
-    return common or laws.law(kinds[spring]).by_name[short]
 
 
 def any_param(short: str) -> Param:
@@ -88,17 +81,15 @@ def direction(
     """
     if name == "site_eta":
         return -1, record.DRAG
-    prefix, _, short = name.partition("_")
-    known = [f"s{i}" for i in range(1, len(chain) + 1)]
-    if prefix in known:
-        spring = known.index(prefix)
+    spring, short = split_name(name)
+    if 0 <= spring < len(chain):
         law, terms = chain[spring], relaxation[spring] if relaxation else 0
         if short == "height":
             return spring, record.OWN_HEIGHT
         if short == record.ETA.name:
             return spring, record.OWN_ETA
         if short in law.own:
-            return spring, law.derivative(short)
+            return spring, law.places.get(short, law.own.index(short))
         if short in names_of(law, terms):
             return spring, record.OWN_RELAXATION + relaxation_names(terms).index(short)
     raise InputError(

@@ -57,7 +57,7 @@ Estimates = Mapping[str, ParameterEstimate]
 
 def may_vanish(name: str) -> bool:
     """Whether zero is a neutral value of a parameter, at which its effect is absent."""
-    return name not in NUISANCE and any_param(split_name(name)[1]).has_neutral
+    return name not in NUISANCE and any_param(split_name(name)[1]).neutral == 0.0
 
 
 def status_of(checklist: Iterable[Check]) -> str:

@@ -24,9 +24,8 @@ from foamfit.springs.laws.record import Law as Law
 from foamfit.springs.laws.record import Param as Param
 
 ENTRY_POINTS = "foamfit.laws"
-_PAPER = (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, microscale.LAW)
-_OPTIONAL = (microscale.STIFFENING_LAW, microscale.MULLINS_LAW, microscale.MEMORY_LAW)
-_LAWS = {law.kind: law for law in (*_PAPER, *_OPTIONAL)}
+_BUILT_IN = (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, *microscale.LAWS)
+_LAWS = {law.kind: law for law in _BUILT_IN}
 PAPER = tuple(_LAWS)  # built-in laws
 _TEXTS: dict[str, str] = {}  # text of each loaded law file, by path
 _asked_packages: list[bool] = []

@@ -331,5 +331,5 @@ def _law(*options: str) -> Law:
     )  # fmt: skip
 
 
-LAW, STIFFENING_LAW, MULLINS_LAW = _law(), _law("stiffening"), _law("mullins")
-MEMORY_LAW = _law("stiffening", "mullins")
+LAWS = _law(), _law("stiffening"), _law("mullins"), _law("stiffening", "mullins")
+LAW, *_, MEMORY_LAW = LAWS

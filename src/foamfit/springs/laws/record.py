@@ -107,11 +107,6 @@ class Param:
         """Limits of the coordinate of random start values."""
         return self.limits if self.inner is None else self.inner
 
-    @property
-    def has_neutral(self) -> bool:
-        """Whether the parameter may be zero, so that its interval can show its absence."""
-        return self.neutral == 0.0
-
 
 class Functions(NamedTuple):
     """The formulas of a registered law; "Your own law" in the documentation specifies them.
@@ -271,10 +266,6 @@ class Law:
     def start_values(self) -> Array:
         """The start values of the parameters where no test gives a scale, see `SCALES`."""
         return self.assembled(lambda p: 0.5 if p.of else p.start[0] * SCALES[p.start[1]])
-
-    def derivative(self, short: str) -> int:
-        """Return the index of the derivative by a parameter."""
-        return self.places.get(short, self.own.index(short))
 
     def named_branch(self, number: int) -> str:
         """Return the name of a branch by its number."""
