@@ -96,16 +96,14 @@ def bound(row, s, point, found):
 @inner
 def bound_stress(row, s, point, found):
     """Set the stresses at the ends of the branch of an EXPLICIT law."""
-    low, high, flat, size = -math.inf, math.inf, True, 0.0
+    low, high = -math.inf, math.inf
     if s.low > -math.inf:
         point[0] = complex(s.low, STEP)
-        low, slope = stress_of(row, s, point, found)
-        flat, size = flat and slope == 0.0, abs(low)
+        low, _ = stress_of(row, s, point, found)
     if s.high < math.inf:
         point[0] = complex(s.high, STEP)
-        high, slope = stress_of(row, s, point, found)
-        flat, size = flat and slope == 0.0, max(size, abs(high))
-    if flat and abs(high - low) <= 1e-14 * size:  # without rounding
+        high, _ = stress_of(row, s, point, found)
+    if abs(high - low) < 1e-14 * max(abs(low), abs(high)):  # a flat branch without rounding
         high = low
     s.sigma_low, s.sigma_high = low, high
 

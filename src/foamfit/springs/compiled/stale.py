@@ -15,15 +15,11 @@ FOLDERS = ("springs", "solve")  # subfolders with compiled functions
 SOLVER = PACKAGE / "solve" / "compiled"
 
 
-def last_change() -> float:
-    """Return when a module with compiled functions was last changed, s since the epoch."""
-    times = [path.stat().st_mtime for name in FOLDERS for path in (PACKAGE / name).rglob("*.py")]
-    return max((at for at in times if at <= time.time()), default=0.0)  # a clock may be wrong
-
-
 def drop_stale(own: Path) -> None:
     """Remove files older than the source from the cache `own` of the laws and from the solver's."""
-    solver, written = [SOLVER / own.name], last_change()
+    times = [path.stat().st_mtime for name in FOLDERS for path in (PACKAGE / name).rglob("*.py")]
+    written = max((at for at in times if at <= time.time()), default=0.0)  # a clock may be wrong
+    solver = [SOLVER / own.name]
     if own.name != "__pycache__":  # the user has named a folder for all caches
         modules = {path.stem for path in SOLVER.glob("*.py")}
         known = own.parent.glob("compiled_*/*.nbi")

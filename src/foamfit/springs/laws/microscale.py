@@ -180,17 +180,18 @@ def _from_stresses(mixed: Array, height: float) -> Array:
 
 def _least_slopes(
     k0: float, kc: float, stiffening: float = 1.0, softening: float = 0.0
-) -> tuple[tuple[float, float], ...]:
-    """Return the derivatives of both ends of ε_* by k0, kc, stiffening and softening."""
+) -> dict[str, float]:
+    """Return the derivatives of the least ε_*; none if it is zero."""
     k, n = k0 * math.exp(-softening), stiffening
     excess, sigma = most_beyond(k, kc, n)
     if excess == 0.0:
-        return ((0.0, 0.0),) * 4
+        return {}
     x, log = sigma / k, math.log1p(n * sigma / k)
     on_a = math.exp(-log / n)  # 1 - a
     by_log_k = -x * on_a / (1.0 + n * x)
     by_n = on_a * (x / (1.0 + n * x) - log / n) / n
-    return (by_log_k / k0, 0.0), (sigma / (kc + sigma) ** 2, 0.0), (by_n, 0.0), (-by_log_k, 0.0)
+    by_kc = sigma / (kc + sigma) ** 2
+    return {"k0": by_log_k / k0, "kc": by_kc, "stiffening": by_n, "softening": -by_log_k}
 
 
 _STRESSES, _SPREADS = (math.log(0.02), math.log(1.0)), (math.log(0.05), math.log(2.0))
@@ -264,16 +265,15 @@ def _law(*options: str) -> Law:
     """Return the law with the parameters of some options; without any, the basic law."""
     extra = tuple(param for option in options for param in _OPTIONAL[option])
     names = tuple(param.name for param in extra)
-    # Parameters on which the least ε_* depends besides k0 and kc, and their indices.
+    # Parameters on which the least ε_* depends besides k0 and kc.
     also = tuple(name for name in names if name != "weakening")
-    picked = [0, 1, *(2 + ("stiffening", "softening").index(name) for name in also)]
 
     def least(k0: float, kc: float, *given: float) -> float:
         return _least_star(k0, kc, **dict(zip(also, given, strict=True)))
 
     def slopes(k0: float, kc: float, *given: float) -> tuple[tuple[float, float], ...]:
-        all_of = _least_slopes(k0, kc, **dict(zip(also, given, strict=True)))
-        return tuple(all_of[place] for place in picked)
+        found = _least_slopes(k0, kc, **dict(zip(also, given, strict=True)))
+        return tuple((found.get(name, 0.0), 0.0) for name in ("k0", "kc", *also))
 
     def read_off(loop: Loop, marks: Array, scales: Any, way: int) -> Array:
         """Read a spring off a loop with its snap stresses at assumed positions.
