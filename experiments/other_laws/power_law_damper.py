@@ -82,7 +82,7 @@ LAW = replace(
     ),
     functions=ff.Functions(stress, ends=ends, switch=switch, viscous=viscous,
                            admissible=admissible),
-    spring=None, published=False, searched=(*PAPER.searched, "c", "n"),
+    spring=None, searched=(*PAPER.searched, "c", "n"),
     read_off=read_off, read_in_series=None, marks=7, neighbours=lambda values, top: iter(()),
     exchanged=None, points=(), compared=(),
 )  # fmt: skip

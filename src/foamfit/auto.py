@@ -53,7 +53,7 @@ LADDER = tuple(
     for group in (
         [(kind, 0) for kind in _OWN],
         [*((f"linear+{kind}", 0) for kind in _OWN), *((kind, 1) for kind in _OWN)],
-        [(with_options(kind, **_ALL), 1) for kind in _SLOW if laws.law(kind).options],
+        [(with_options(kind, **_ALL), 1) for kind in _SLOW if laws.options_of(kind)],
         [(f"{kind}+{kind}", 0) for kind in _OWN],
         [(f"linear+{kind}+{kind}", 0) for kind in _QUICK],
         [(f"{kind}+{kind}", 1) for kind in _SLOW],
@@ -66,7 +66,7 @@ HISTORY = (
         (Model.parse(with_options(kind, **_ALL), terms),)
         for kind in _SLOW
         for terms in (1, 2)
-        if laws.law(kind).options
+        if laws.options_of(kind)
     ),
 )
 # Number of consecutive groups without a gain after which the comparison ends.

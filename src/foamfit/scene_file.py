@@ -123,8 +123,9 @@ def _spring(table: dict[str, Any], number: int) -> tuple[Spring, float, float]:
     """Return a spring, its height, m, and the mass above it, kg."""
     where = f"[chain] spring {number}"
     law = laws.law(_one_of(laws.kinds())(table.get("kind"), f"{where}: kind"))
-    extra = max(law.options, key=len, default=())  # all parameters that options can free
-    wide = laws.law(laws.with_options(law.kind, extra))
+    wide = laws.law(
+        laws.with_options(law.kind, laws.options_of(law.kind))
+    )  # all parameters that options can free
     law = wide if set(wide.own) - set(law.own) & set(table) else law
     keys = _SPRING | {name: _of(param) for name, param in law.by_name.items()}
     keys |= {"relaxation": _RELAXATION} if law.hysteretic else {}

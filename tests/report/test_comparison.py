@@ -269,7 +269,7 @@ def test_no_published_set_has_microscale_springs() -> None:
 def test_a_law_of_ones_own_is_compared_parameter_by_parameter(monkeypatch) -> None:
     params = (ff.Param("k", ("k", "1"), "Pa"), ff.Param("limit", ("z", "m")))
     law = replace(laws.law("linear"), kind="own", params=params, compared=(), hysteretic=True)
-    monkeypatch.setitem(laws._LAWS, "own", replace(law, published=False))
+    monkeypatch.setitem(laws._LAWS, "own", law)
     made = {
         "s1_k": fabricated.estimate("s1_k", 2e6),
         "s1_limit": fabricated.estimate("s1_limit", 0.1),

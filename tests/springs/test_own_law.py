@@ -81,9 +81,7 @@ def copy(internal: int) -> Law:
     functions = ff.Functions(*given, **ends)
     copied = {"kind": f"copy-{internal}", "spring": None}
     return laws.register(
-        dataclasses.replace(
-            laws.bistable.LAW, functions=functions, internal=internal, options={}, **copied
-        )
+        dataclasses.replace(laws.bistable.LAW, functions=functions, internal=internal, **copied)
     )
 
 

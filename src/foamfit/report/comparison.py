@@ -165,8 +165,9 @@ class Side:
     @property
     def unpublished(self) -> str:
         """The first kind of spring without published parameters, or ""."""
-        kinds = (one.kind for one in self.model.laws if one.hysteretic and not one.published)
-        return next(kinds, "")
+        known = {kind for one in published_sets.values() for kind in one.model.split("+")}
+        kinds = (one.kind for one in self.model.laws if one.hysteretic)
+        return next((kind for kind in kinds if kind not in known), "")
 
     def evaluate(
         self, names: Sequence[str], formula: Callable[..., Any]

@@ -200,8 +200,8 @@ def with_options(model: str, **options: bool) -> str:
     asked = tuple(name for name in FREED if name in asked or read.options[name])
     kinds = read.words.split("+")
     for name in asked:
-        if not any((name,) in laws.law(kind).options for kind in kinds):
-            having = [law.kind for law in laws.records() if (name,) in law.options]
+        if not any(name in laws.options_of(kind) for kind in kinds):
+            having = [kind for kind in laws.kinds() if name in laws.options_of(kind)]
             raise InputError(
                 f"{name} needs a {' or '.join(having)} spring, and the model '{read.words}' has "
                 f"none; take model {having[0]}, or leave {name} out"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import copyreg
 import importlib.util
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -60,10 +60,14 @@ def records() -> tuple[Law, ...]:
     return tuple(_LAWS.values())
 
 
-def with_options(kind: str, options: tuple[str, ...]) -> str:
-    """Return the name of a law's variant with some options; `kind` if it has none of them."""
-    known = law(kind).options
-    return known.get(tuple(one for one in FREED if one in options and (one,) in known), kind)
+def options_of(kind: str) -> tuple[str, ...]:
+    """Return the options that free further parameters of a law."""
+    return tuple(one for one in FREED if f"{kind}, {one}" in _LAWS)
+
+
+def with_options(kind: str, options: Collection[str]) -> str:
+    """Return the name of a law's variant with those of the options that it has."""
+    return ", ".join((kind, *(one for one in options_of(kind) if one in options)))
 
 
 def is_registered(kind: str) -> bool:

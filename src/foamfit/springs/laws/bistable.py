@@ -332,5 +332,4 @@ LAW = Law(
     note="A1 and C1 are where the spring starts to snap and has snapped on loading; C2 and A2 "
     "where it starts to snap back and has recovered on unloading.",
     remembers=False,
-    published=True,
 )  # fmt: skip

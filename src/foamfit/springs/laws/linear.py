@@ -60,7 +60,6 @@ LAW = Law(
     hysteretic=False,
     spring=LinearSpring,
     remembers=False,
-    published=True,
 )  # fmt: skip
 UNILATERAL_LAW = replace(
     LAW, kind="unilateral", title="linear spring without tension", spring=_unilateral,

@@ -317,10 +317,6 @@ def _law(*options: str) -> Law:
             "k0", "kc", *names, "eps_star", "sigma_plus", "sigma_minus", "spread_plus",
             "spread_minus",
         ),
-        options={} if options else {
-            one: ", ".join(("microscale", *one))
-            for one in (("stiffening",), ("mullins",), ("stiffening", "mullins"))
-        },
         read_off=read_off,
         marks=7 + len(names),
         onset=lambda values: values[3],

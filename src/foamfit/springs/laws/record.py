@@ -195,9 +195,6 @@ class Law:
     note: str = ""  #: sentence of the report on the marks of the figure
     #: whether its state is more than its branch, so that partial unloading leaves the branch
     remembers: bool = True
-    published: bool = False  #: whether the paper has parameters of it
-    #: variants of the law by options of a fit
-    options: Mapping[tuple[str, ...], str] = field(default_factory=dict)
     word: str = ""  #: name in models, if it is not `kind`
     #: indices of derivatives by parameters, if not in the order of `params`
     places: Mapping[str, int] = field(default_factory=dict)
