@@ -111,7 +111,7 @@ class Spring(ABC):
         return self.solver_row(0)
 
     def solver_row(self, room: int) -> Array:
-        """Return the row with `room` relaxation terms; InputError if the law refuses the values."""
+        """Return the row with `room` relaxation terms; InputError if the law refuses the spring."""
         from foamfit.springs.compiled import compiled, fill_row
 
         made, values = compiled(self.law), np.array(self.values)
@@ -233,7 +233,7 @@ class LawSpring(Spring):
             put(self, name, value)
         freeze(self, law, relaxation)
         put(self, "numbers", self.values)
-        assert self.row is not None  # which the law may refuse
+        self.solver_row(0)  # the law may refuse it
 
     @property
     def law(self) -> Law:
