@@ -92,8 +92,15 @@ class Bench:
     def sizes(self, names: tuple[str, ...], values: np.ndarray) -> np.ndarray:
         return np.ones(len(names))
 
-    def space(self) -> Any:
-        return SimpleNamespace(complete=lambda values: values, admit=lambda values, held: values)
+    def space(self, absolute: tuple[str, ...] = ()) -> Any:
+        """Each coordinate is the value of its parameter."""
+        names, same = tuple(self.index), lambda values: values
+        self.objective.jacobian_along = lambda values, moves: self.slopes(values, names) @ moves
+        return SimpleNamespace(
+            coordinates=[SimpleNamespace(place=place) for place in self.index.values()],
+            box=np.repeat([[self.low], [100.0]], len(names), axis=1),
+            complete=same, encode=same, decode=same, slopes=lambda *_: np.eye(len(names)),
+        )  # fmt: skip
 
     def slopes(self, values: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
         t, b = self.objective.time, values[1]

@@ -172,8 +172,9 @@ def truth(problem: Problem) -> np.ndarray:
 
 def refitted(problem: Problem, values: np.ndarray, names: tuple[str, ...]) -> BestPoint:
     around = BestPoint(problem, values, names)
-    end = Refit(around, Tracker(problem.objective)).run(values)
-    return BestPoint(problem, end.point, names)
+    refit = Refit(around, Tracker(problem.objective))
+    end = refit.descend(refit.space.encode(values), refit.box, 40)
+    return BestPoint(problem, refit.values(end), names)
 
 
 @pytest.mark.parametrize("kind", ["rate effect", "own law"])

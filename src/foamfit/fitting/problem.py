@@ -330,12 +330,13 @@ class Problem:
             values[self.index[name]] = params[name].value
         return values
 
-    def space(self) -> Space:
-        """Return the box of the search."""
+    def space(self, absolute: tuple[str, ...] = ()) -> Space:
+        """Return the box of the search; the coordinates of some parameters may be their values."""
         params = [self.params[name] for name in self.names]
         low, high = np.array([one.min for one in params]), np.array([one.max for one in params])
         vector = self.vector()
-        return Space(self.model, self.names, self.scales, vector, self.free(), low, high, self.tied)
+        free, tied = self.free(), self.tied
+        return Space(self.model, self.names, self.scales, vector, free, low, high, tied, absolute)
 
     def sizes(self, names: tuple[str, ...], values: Array) -> Array:
         """Return the scales of some parameters at a point."""

@@ -24,13 +24,13 @@ from foamfit.springs.parameters import NUISANCE
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING, WEAK
-from foamfit.trust.profile import BETTER, PLACED, STEPS, Refit, departures, trace
+from foamfit.trust.profile import BETTER, PLACED, SIDES, STEPS, Refit, departures, trace
 
 # "auto" profiles a parameter if the root of the cost departs from a straight line by this share at
 # an end of its local interval.
 BENT = 0.15
 # Assumed number of refits per profile and of evaluations per refit, for the expected run time.
-REFITS, EVALUATIONS = 9, 6.0
+REFITS, EVALUATIONS = 6, 8.0
 # Smallest number of samples of a Markov chain from which percentiles are computed.
 ENOUGH_DRAWS = 40
 # A minimum is hardly worse than the best if the root of its χ² is within this multiple of the 95 %
@@ -96,7 +96,7 @@ def assess(
         return _by_mcmc(best, choice, tracker)
     others = [(x, residual := tracker.consider(x), _halves(best, x, residual)) for x in minima]
     if method == "profile":
-        return _with_minima(best, _by_profiles(best, known, tracker), others)
+        return _with_minima(best, _by_profiles(best, dict.fromkeys(known, SIDES), tracker), others)
     far = np.abs(departures(best)).max(axis=1, initial=0.0)
     for point, residual, _ in others:  # a minimum within the cut but outside the local interval
         apart = np.abs(point - best.values)[best.places] / best.spread.stderr
@@ -106,9 +106,15 @@ def assess(
     # Where the range is wider, model error outweighs noise, and a local interval is enough. Where
     # other minima leave the parameter undetermined, a profile would not change that.
     local = [n for n in bent if n in ranges and np.ptp(ranges[n]) > np.ptp(best.local(n))]
-    wide = _with_minima(best, Intervals(), others).ends
-    lost = [n for n in bent if n in wide and np.ptp(wide[n]) > 2.0 * NOTHING * best.size(n)]
-    made = _by_profiles(best, [n for n in bent if n not in (*local, *lost)], tracker, budget)
+    wide = {n: best.local(n) for n in bent} | _with_minima(best, Intervals(), others).ends
+    lost = [n for n in bent if np.ptp(wide[n]) > 2.0 * NOTHING * best.size(n)]
+    # On a side where another minimum extends the interval, a profile would hardly do so.
+    sides = {
+        n: [sign for sign, *ends in zip((-1.0, 1.0), best.local(n), wide[n], strict=True)
+            if ends[0] == ends[1]]
+        for n in bent if n not in (*local, *lost)
+    }  # fmt: skip
+    made = _by_profiles(best, {n: sign for n, sign in sides.items() if sign}, tracker, budget)
     made = _with_minima(best, replace(made, doubtful=(*made.doubtful, *local)), others)
     return made if best.misfits or made.better is not None else _with_far(best, made, tracker)
 
@@ -159,10 +165,10 @@ def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
     On a parabola, χ² there is nine times the cut. Other parameters that the refit moves as far
     outside their own intervals are included.
     """
-    refit, elsewhere, warnings = Refit(best, tracker), dict(made.elsewhere), made.warnings
+    elsewhere, warnings = dict(made.elsewhere), made.warnings
     try:
         for name in best.known:
-            column, value = best.names.index(name), best.value(name)
+            column, refit = best.names.index(name), Refit(best, tracker, name)
             low, high = made.ends.get(name, best.local(name))
             if name in NUISANCE or high - low > 2.0 * WEAK * best.sizes[column]:
                 continue
@@ -172,13 +178,13 @@ def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
             for outside in (2.0 * low - high, 2.0 * high - low):
                 if name in elsewhere or not least <= outside <= most:
                     continue
-                start = refit.along(column, outside - value)
-                found = refit.run(start, (column, outside), iterations=iterations)
+                found = refit.hold(refit.origin, outside, iterations)
                 if found is None:
                     continue
+                values = refit.values(found)
                 if best.rises(found.residual)[column] < -BETTER * best.quantiles[column] ** 2:
-                    return replace(made, better=found.point)
-                elsewhere = _far_values(best, made, found.point, found.residual) | elsewhere
+                    return replace(made, better=values)
+                elsewhere = _far_values(best, made, values, found.residual) | elsewhere
     except STOPPING as error:
         warnings = (*warnings, say("interval", "far", by=what_stopped(error)))
     return replace(made, elsewhere=elsewhere, warnings=warnings)
@@ -211,21 +217,24 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
 
 
 def _by_profiles(
-    best: BestPoint, names: Sequence[str], tracker: Tracker, budget: float = math.inf
+    best: BestPoint,
+    sides: Mapping[str, Sequence[float]],
+    tracker: Tracker,
+    budget: float = math.inf,
 ) -> Intervals:
-    """Profile some parameters, until all are done, a better point is found or time is up."""
+    """Profile the `sides` of some parameters, until a better point is found or time is up."""
     allowed = tracker.objective.evaluations + budget
     profiles, better = list[Profile](), None
-    for name in names:
+    for name, signs in sides.items():
         if tracker.objective.evaluations >= allowed:
             break
-        profile, better = trace(best, name, tracker)
+        profile, better = trace(best, name, tracker, signs)
         profiles.append(profile)
         if better is not None or profile.stopped:
             break
     ends = {one.name: one.ci95 for one in profiles if one.complete}
-    left = tuple(name for name in names if name not in ends)
-    facts = {"done": len(ends), "count": len(names), "names": ", ".join(left)}
+    left = tuple(name for name in sides if name not in ends)
+    facts = {"done": len(ends), "count": len(sides), "names": ", ".join(left)}
     stopped = (one.stopped for one in profiles if one.stopped)
     warnings = tuple(say("interval", "profiles", by=by, **facts) for by in stopped)
     methods = dict.fromkeys(ends, "profile likelihood")
@@ -312,8 +321,8 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     import emcee
 
     objective = best.problem.objective
-    refit = Refit(best, Tracker(objective) if tracker is None else tracker)
-    low, high = best.box
+    tracker = Tracker(objective) if tracker is None else tracker
+    (low, high), complete = best.box, best.problem.space().complete
     variances = [process.variance * process.tau for process in best.spread.noise]
     weights = np.repeat(1.0 / np.array(variances), objective.sizes)
     weights = np.append(weights, np.full(len(objective.priors), objective.unit**-2))
@@ -321,9 +330,10 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     def log_probability(scaled: Array) -> float:
         point = best.values.copy()
         own = point[best.places] = scaled * best.sizes
-        inside = np.all((own >= low) & (own <= high))
-        residual = refit.residual(refit.space.complete(point)) if inside else None
-        return -0.5 * float(weights @ residual**2) if residual is not None else -np.inf
+        if not np.all((own >= low) & (own <= high)):
+            return -np.inf
+        failures, residual = objective.failures, tracker.residual(complete(point))
+        return -0.5 * float(weights @ residual**2) if objective.failures == failures else -np.inf
 
     count, k = walkers(best), len(best.names)
     sampler = emcee.EnsembleSampler(count, k, log_probability)

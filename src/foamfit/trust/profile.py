@@ -7,128 +7,140 @@ cost is a parabola, profile and local interval are therefore the same.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.fitting.levenberg import Iterate, descend, following
-from foamfit.fitting.search import STOPPING, Tracker, what_stopped
+from foamfit.fitting.search import STOPPING, Tracker, squares, what_stopped
 from foamfit.results import Profile
 from foamfit.trust.best_point import BestPoint
 
-# A refit ends if the expected gain of the cost is below this share of the 95 % cut; with a coarser
-# limit its end would depend on the start, and so on rounding.
-ENOUGH = 1e-6
+# A refit ends if the expected gain of the cost is below this share of the 95 % cut.
+ENOUGH = 1e-4
 STEPS = 40  # largest number of steps of a refit
-# A profile is followed until its χ² is this multiple of the 95 % cut, to cross small barriers
-# between shallow minima.
-BEYOND = 2.0
+# The first refit is at the end of the local interval. Later steps outward, and the first one if the
+# others cannot follow so far (if the root of χ² before the refit exceeds `ASTRAY` times that of the
+# cut), are this share of half the interval; they grow where the cost hardly rises.
+STEP, ASTRAY, GROWTH, HARDLY = 0.5, 2.0, 1.6, 0.35
+# A profile is followed until the root of χ² is this multiple of that of the cut, to cross small
+# barriers between shallow minima, unless its first refit shows a parabola: the roots agree by this
+# share.
+BEYOND, PARABOLA = 1.4, 0.05
 # Largest number of refits on one side of a profile: outward until beyond the cut, and to place it.
-OUTWARD, INWARD = 14, 6
-# The root of χ² at a crossing differs from the root of the cut by at most this share.
-PLACED = 0.02
+OUTWARD, INWARD = 14, 3
+# The root of χ² of the refit next to a crossing differs from that of the cut by at most this share.
+PLACED = 0.03
 # A profile that falls below the best point by this share of the cut has found a better minimum.
 BETTER = 0.01
+SIDES = (-1.0, 1.0)
 
 
 @dataclass(eq=False)
 class Refit:
-    """Least squares near the best point."""
+    """Least squares near the best point in the coordinates of the search.
+
+    The parameter of a given name can be held; its coordinate is then its value, SI.
+    """
 
     best: BestPoint
     tracker: Tracker  # simulates, counts evaluations and raises at the deadline
+    name: str = ""
 
     def __post_init__(self) -> None:
-        """Set the space of the parameters and the gain at which a refit ends."""
-        self.space = self.best.problem.space()
-        cuts = self.best.quantiles**2 * self.best.spread.inflation  # rise at the ends of intervals
-        self.enough = ENOUGH * float(min(cuts[np.isfinite(cuts)], default=1.0))
+        """Set the space, its box, the functions of a descent, and the best point as an iterate."""
+        best = self.best
+        self.space = best.problem.space((self.name,) if self.name else ())
+        self.functions = squares(self.tracker, self.space)
+        places = np.array([one.place for one in self.space.coordinates])
+        self.held = places == best.index.get(self.name, -1)
+        point = np.where(self.held, best.values[places], self.space.encode(best.values))
+        self.box = np.where(np.isin(places, best.places), self.space.box, point)
+        moves = self.space.slopes(point, best.values)[best.places]
+        self.origin = Iterate(point, best.residual, best.jacobian @ moves)
+        column = best.names.index(self.name) if self.name else slice(None)
+        cuts = (best.quantiles**2 * best.spread.inflation)[column]  # rises at ends of intervals
+        self.least = ENOUGH * float(np.min(cuts, where=np.isfinite(cuts), initial=1e300))
 
     def residual(self, point: Array) -> Array | None:
-        """Return the residual of a point; None if the simulation fails."""
+        """Return the residual at a point; None if the simulation fails."""
         objective = self.tracker.objective
-        failures, residual = objective.failures, self.tracker.residual(point)
+        failures, residual = objective.failures, self.functions[0](point)
         return residual if objective.failures == failures else None
 
-    def rise(self, point: Array) -> float:
-        """Return the rise of the cost from the best point; infinite if the simulation fails."""
-        residual = self.residual(point)
-        return np.inf if residual is None else float(residual @ residual) - self.best.cost
+    def shifted(self, near: Iterate, value: float) -> Iterate | None:
+        """Return a point with the held parameter at a value; the others follow from a point `near`.
 
-    def point(self, scaled: Array, box: Array) -> Array:
-        """Return all parameters from the scaled ones, clipped to the limits `box` (SI)."""
-        point = self.best.values.copy()
-        point[self.best.places] = np.clip(scaled * self.best.sizes, *box)
-        return self.space.admit(point, self.best.places[box[0] == box[1]])
-
-    def moved(self, at: Array, step: Array) -> Array:
-        """Return a point moved by a scaled step, clipped to the limits."""
-        return self.point(at[self.best.places] / self.best.sizes + step, self.best.box)
-
-    def along(self, column: int, shift: float) -> Array:
-        """Return the best point with a parameter shifted (SI) and the others by correlation."""
-        covariance = self.best.spread.matrix[:, column]
-        along = np.nan_to_num(covariance / covariance[column]) / self.best.sizes
-        return self.moved(self.best.values, shift * along)
-
-    def run(
-        self,
-        start: Array,
-        hold: tuple[int, float] | None = None,
-        *,
-        iterations: int = STEPS,
-        near: Iterate | None = None,
-    ) -> Iterate | None:
-        """Descend from a point; `hold` is the column and the value of a fixed parameter, if any.
-
-        The Jacobian of a point `near` the start saves one of its own. Returns None if the start
-        cannot be simulated.
+        They follow to first order, and less where that would raise the cost above that without
+        them. The Jacobian is Broyden's update. Returns None if nothing can be simulated.
         """
-        best, sizes, box = self.best, self.best.sizes, self.best.box.copy()
-        if hold is not None:
-            box[:, hold[0]] = hold[1]
+        alone, *together = following(near, np.where(self.held, value - near.point, 0.0), self.held)
+        most = near.cost - near.expected(alone)
+        for step in (*together, alone):
+            point = np.clip(near.point + step, *np.where(self.held, value, self.box))
+            residual = self.residual(point)
+            if residual is not None and (step is alone or float(residual @ residual) <= most):
+                return near.updated(point, residual) if np.any(point != near.point) else near
+        return None
 
-        def residual(scaled: Array) -> Array:
-            return self.tracker.residual(self.point(scaled, box))
-
-        def jacobian(scaled: Array) -> Array:
-            return np.asarray(best.problem.slopes(self.point(scaled, box), best.names) * sizes)
-
-        begin = np.clip(start[best.places], *box) / sizes
-        first = self.residual(self.point(begin, box))
-        if first is None:
+    def hold(self, near: Iterate, value: float, iterations: int = STEPS) -> Iterate | None:
+        """Descend with the parameter held at a value, from a point near it; None if that fails."""
+        start = self.shifted(near, value)
+        if start is None:
             return None
-        at = Iterate(begin, first, jacobian(begin) if near is None else near.jacobian)
-        end = descend(
-            residual, jacobian, at, box / sizes, iterations, least=self.enough, damping=1e-6,
-            stale=near is not None,
+        return self.descend(start, np.where(self.held, value, self.box), iterations)
+
+    def descend(self, start: Iterate | Array, box: Array, iterations: int) -> Iterate:
+        """Descend in a box; the Jacobian of an iterate is only that of a nearby point."""
+        return descend(
+            *self.functions, start, box, iterations, least=self.least, damping=1e-6,
+            stale=isinstance(start, Iterate),
         )  # fmt: skip
-        return replace(end, point=self.point(end.point, box))
+
+    def after_step(self, at: Iterate) -> float:
+        """Return the sum of squares after one step of all but the held one, with local slopes."""
+        slopes = self.origin.jacobian[:, ~self.held]
+        ahead = slopes @ np.linalg.lstsq(slopes, at.residual, rcond=1e-10)[0]
+        return float(at.residual @ (at.residual - ahead))
+
+    def values(self, at: Iterate) -> Array:
+        """Return all parameters of a point, SI."""
+        return self.space.decode(at.point)
 
 
 class _Side:
     """One side of a profile, below (-1) or above (+1): refits from the best point outward."""
 
-    def __init__(self, refit: Refit, name: str, sign: float) -> None:
-        best, self.column = refit.best, refit.best.names.index(name)
-        self.refit, self.sign, self.place = refit, sign, best.index[name]
-        self.quantile, self.half = float(best.quantiles[self.column]), best.halves[self.column]
-        self.limit = best.limits(name)[0 if sign < 0 else 1]
-        self.refits = [Iterate(best.values, best.residual, best.scaled)]
+    def __init__(self, refit: Refit, sign: float) -> None:
+        best, column = refit.best, refit.best.names.index(refit.name)
+        self.refit, self.sign, self.inflation = refit, sign, best.spread.inflation[column]
+        self.quantile, self.half = float(best.quantiles[column]), float(best.halves[column])
+        self.limit = best.limits(refit.name)[0 if sign < 0 else 1]
+        self.refits = [refit.origin]
 
     def value(self, at: Iterate) -> float:
         """Return the fixed value of the parameter."""
-        return float(at.point[self.place])
+        return float(at.point[self.refit.held][0])
 
     def rise(self, at: Iterate) -> float:
         """Return the rise of the cost as a χ²."""
-        return float(self.refit.best.rises(at.residual)[self.column])
+        return (at.cost - self.refit.origin.cost) / float(self.inflation)
 
     def root(self, at: Iterate) -> float:
-        """Return the root of the rise, which is linear along a parabola."""
-        return math.sqrt(max(self.rise(at), 0.0))
+        """Return the root of the rise over that of the cut; it is linear along a parabola."""
+        return math.sqrt(max(self.rise(at), 0.0)) / self.quantile
+
+    def slope(self, at: Iterate) -> float:
+        """Return the outward derivative of the root along the profile, 1/SI.
+
+        The other parameters do not change the cost to first order.
+        """
+        root, slope = self.root(at), self.sign * float(at.gradient[self.refit.held][0])
+        if root < 1e-6:
+            return 1.0 / self.half
+        return slope / (root * self.quantile**2 * float(self.inflation))
 
     @property
     def better(self) -> bool:
@@ -137,126 +149,144 @@ class _Side:
 
     @property
     def bracket(self) -> tuple[Iterate, Iterate | None]:
-        """The outermost refit below the cut, and the next one; None if the profile is open."""
-        last = max(i for i, at in enumerate(self.refits) if self.root(at) < self.quantile)
-        return self.refits[last], self.refits[last + 1] if last + 1 < len(self.refits) else None
+        """The outermost refit below the cut, and the lowest beyond it; None if there is none.
+
+        A nearer one above that has stalled.
+        """
+        last = max(i for i, at in enumerate(self.refits) if self.root(at) < 1.0)
+        return self.refits[last], min(self.refits[last + 1 :], key=self.root, default=None)
+
+    def parabola(self) -> float | None:
+        """Return the crossing by Newton's method if the only refit is near it, else None."""
+        at, slope = self.refits[-1], self.slope(self.refits[-1])
+        if len(self.refits) != 2 or abs(self.root(at) - 1.0) > PARABOLA or slope <= 0.0:
+            return None
+        return self._ahead(at, (1.0 - self.root(at)) / slope)
+
+    def crossing(self, inner: Iterate, outer: Iterate) -> float:
+        """Return the value at which the root of the rise crosses the cut.
+
+        It is that of the cubic through both roots with their slopes, or else of the line.
+        """
+        width, y0, y1 = self.value(outer) - self.value(inner), self.root(inner), self.root(outer)
+        a, b = (self.slope(at) * abs(width) for at in (inner, outer))
+        roots = np.roots([a + b - 2.0 * (y1 - y0), 3.0 * (y1 - y0) - 2.0 * a - b, a, y0 - 1.0])
+        inside = roots.real[(abs(roots.imag) < 1e-9) & (roots.real >= 0.0) & (roots.real <= 1.0)]
+        share = float(inside[0]) if inside.size == 1 else (1.0 - y0) / (y1 - y0)
+        return self.value(inner) + share * width
 
     @property
     def bound(self) -> float:
-        """Value at which the root of the rise crosses that of the cut, or else the limit."""
+        """Value at which the root of the rise crosses that of the cut, or else the limit.
+
+        The local end if there is no refit.
+        """
+        if len(self.refits) == 1:
+            return self._ahead(self.refits[0], self.half)
+        if (end := self.parabola()) is not None:
+            return end
         inner, outer = self.bracket
-        if outer is None:
-            return self.limit
-        share = (self.quantile - self.root(inner)) / (self.root(outer) - self.root(inner))
-        return self.value(inner) + share * (self.value(outer) - self.value(inner))
+        return self.limit if outer is None else self.crossing(inner, outer)
 
     def follow(self) -> None:
         """Go outward until well beyond the cut, and place the crossing."""
-        step, refused = 0.5 * self.half, 0
-        for _ in range(OUTWARD):
-            last = self.refits[-1]
-            if self.value(last) == self.limit or refused > 3:
-                break
-            value = self.value(last) + self.sign * step
-            over = self.sign * (value - self.limit) > 0.0
-            found = self._hold(self.limit if over else value, last)
-            if found is None:
-                step, refused = 0.3 * step, refused + 1
-                continue
-            self.refits.append(found)
-            if self.rise(found) >= BEYOND * self.quantile**2 or self.better:
-                break
-            if self.root(found) - self.root(last) < 0.35 * self.quantile:
-                step *= 1.6
-        for _ in range(INWARD):
+        self._go_outward()
+        for _ in range(INWARD if self.parabola() is None else 0):
             inner, outer = self.bracket
             if outer is None or self.better:
                 break
-            miss = min(abs(self.root(at) - self.quantile) for at in (inner, outer))
-            placed = miss <= PLACED * self.quantile
-            if placed or (found := self._hold(self.bound, inner)) is None:
+            value = self.crossing(inner, outer)
+            near = min(inner, outer, key=lambda at: abs(self.root(at) - 1.0))
+            if abs(self.root(near) - 1.0) <= PLACED or not (found := self.refit.hold(near, value)):
                 break
             self.refits.append(found)
             self.refits.sort(key=lambda at: self.sign * self.value(at))
 
-    def _hold(self, value: float, near: Iterate) -> Iterate | None:
-        """Refit at a fixed value, starting from a nearby refit; None if the start fails.
-
-        At the start the other parameters follow if that lowers the cost.
-        """
-        shift = np.zeros(len(self.refit.best.names))
-        shift[self.column] = (value - self.value(near)) / self.refit.best.sizes[self.column]
-        alone, *together = following(near, shift, np.arange(shift.size) == self.column)
-        start = self.refit.moved(near.point, alone)
-        least = self.refit.rise(start)
-        for step in together:
-            trial = self.refit.moved(near.point, step)
-            if self.refit.rise(trial) < least:
-                start = trial
+    def _go_outward(self) -> None:
+        origin, step, refused = self.refit.origin, self.half, 0
+        start = self.refit.shifted(origin, self._ahead(origin, step))
+        if start is None or self.root(start) > ASTRAY:
+            step *= STEP
+        for _ in range(OUTWARD):
+            last = self.refits[-1]
+            if self.value(last) == self.limit or refused > 3:
                 break
-        return self.refit.run(start, (self.column, value), near=near)
+            found = self.refit.hold(last, self._ahead(last, step))
+            if found is None:
+                step, refused = 0.3 * step, refused + 1
+                continue
+            self.refits.append(found)
+            if self.root(found) >= BEYOND or self.better or self.parabola() is not None:
+                break
+            if step == self.half:
+                step *= STEP
+            if self.root(found) - self.root(last) < HARDLY:
+                step *= GROWTH
+
+    def _ahead(self, at: Iterate, step: float) -> float:
+        """Return the value a step outward, not beyond the limit."""
+        value = self.value(at) + self.sign * step
+        return self.limit if self.sign * (value - self.limit) > 0.0 else value
 
 
-def trace(best: BestPoint, name: str, tracker: Tracker) -> tuple[Profile, Array | None]:
-    """Follow the least cost along a parameter to both sides, past the 95 % cut.
+def trace(
+    best: BestPoint, name: str, tracker: Tracker, sides: Sequence[float] = SIDES
+) -> tuple[Profile, Array | None]:
+    """Follow the least cost along a parameter past the 95 % cut, by default to both `sides`.
 
     It uses the adjusted likelihood ratio: the rise of the cost over `Covariance.inflation` is a χ²
     of one degree of freedom even if noise is correlated (Chandler & Bate 2007, Biometrika 94, 167).
-    If the deadline or Ctrl-C ends it early, it is incomplete and `ci95` covers only the part
-    computed so far. A point of clearly lower cost than the best one, if there is one, is returned
-    too.
+    `ci95` has the local end on a side that is not followed. If the deadline or Ctrl-C ends it
+    early, it is incomplete. A point of clearly
+    lower cost than the best one, if there is one, is returned too.
     """
-    refit, stopped = Refit(best, tracker), None
-    low, high = _Side(refit, name, -1.0), _Side(refit, name, 1.0)
+    refit, stopped = Refit(best, tracker, name), None
+    low, high = _Side(refit, -1.0), _Side(refit, 1.0)
     try:
-        low.follow()
-        high.follow()
+        for side in (one for one in (low, high) if one.sign in sides):
+            side.follow()
     except STOPPING as error:
         stopped = what_stopped(error)
     refits = low.refits[::-1] + high.refits[1:]
-    better = min(refits, key=lambda at: at.cost).point if low.better or high.better else None
-    begun = stopped is None or len(high.refits) > 1
+    better = low.better or high.better
     profile = Profile(
         name=name,
         values=np.array([low.value(at) for at in refits]),
         rises=np.array([low.rise(at) for at in refits]),
-        points=np.array([at.point for at in refits]),
+        points=np.array([refit.values(at) for at in refits]),
         cut=low.quantile**2,
-        ci95=(low.bound, high.bound if begun else best.value(name)),
+        ci95=(low.bound, high.bound),
         stopped=stopped,
     )
-    return profile, better
+    return profile, refit.values(min(refits, key=lambda at: at.cost)) if better else None
 
 
 def departures(best: BestPoint) -> Array:
     """Return the departure of the cost from a parabola at both ends of each interval, (k, 2).
 
     A parameter is moved to an end of its local interval (less if the simulation fails there), the
-    others follow their correlation, and one linear step of these, with the local slopes, completes
-    the refit. The departure is the root of the rise over that of a parabola, less 1; it is zero if
-    a limit is close to the best point, infinite if the simulation fails.
+    others follow, and one linear step of these, with the local slopes, completes the refit. The
+    departure is the root of the rise over that of a parabola, less 1; it is zero if a limit is
+    close to the best point, infinite if the simulation fails.
     """
-    refit, k = Refit(best, Tracker(best.problem.objective)), len(best.names)
-    out, normal = np.zeros((k, 2)), best.scaled.T @ best.scaled
-
-    def least(residual: Array, others: NDArray[np.intp]) -> float:
-        """Return the sum of squares after one linear step of the other parameters."""
-        inverse = np.linalg.pinv(normal[np.ix_(others, others)], rcond=1e-10, hermitian=True)
-        slope = best.scaled[:, others].T @ residual
-        return float(residual @ residual - slope @ inverse @ slope)
-
-    for i, side in np.ndindex(k, 2):
-        others, half = np.delete(np.arange(k), i), float(best.halves[i])
-        to_limit = abs(float(best.box[side, i] - best.values[best.places[i]]))
-        if not to_limit > 0.05 * half:
-            continue
-        out[i, side] = np.inf
-        for share in (1.0, 0.5, 0.25):
-            shift = min(share * half, to_limit)
-            residual = refit.residual(refit.along(i, shift if side else -shift))
-            if residual is not None:
-                rise = least(residual, others) - least(best.residual, others)
-                root = math.sqrt(max(rise / float(best.spread.inflation[i]), 0.0))
-                out[i, side] = root * float(best.spread.stderr[i]) / shift - 1.0
-                break
+    out, tracker = np.zeros((len(best.names), 2)), Tracker(best.problem.objective)
+    for i, name in enumerate(best.names):
+        refit, value, half = Refit(best, tracker, name), best.value(name), float(best.halves[i])
+        for side, limit in enumerate(best.limits(name)):
+            if abs(limit - value) > 0.05 * half:
+                out[i, side] = _departure(refit, limit - value, half)
     return out
+
+
+def _departure(refit: Refit, to_limit: float, half: float) -> float:
+    """Return the departure towards a limit (SI, signed) at an end of an interval."""
+    origin, column = refit.origin, refit.best.names.index(refit.name)
+    stderr, inflation = (getattr(refit.best.spread, n)[column] for n in ("stderr", "inflation"))
+    for share in (1.0, 0.5, 0.25):
+        shift = min(share * half, abs(to_limit))
+        value = refit.best.value(refit.name) + math.copysign(shift, to_limit)
+        if (found := refit.shifted(origin, value)) is not None:
+            rise = refit.after_step(found) - refit.after_step(origin)
+            root = math.sqrt(max(rise / float(inflation), 0.0))
+            return root * float(stderr) / shift - 1.0
+    return math.inf

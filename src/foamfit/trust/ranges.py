@@ -43,13 +43,16 @@ def alike(
     far from the best point as possible, starting from the linear prediction. After `budget`
     evaluations no further refit is begun.
     """
-    most, refit = tolerance(best), Refit(best, tracker)
-    refit.enough, allowed = 0.01 * most, tracker.objective.evaluations + budget
-    out = [best.values, *(point for point in minima if refit.rise(point) <= most)]
+    most, allowed = tolerance(best), tracker.objective.evaluations + budget
+    out = [best.values]
+    for point in minima:
+        failures, residual = tracker.objective.failures, tracker.residual(point)
+        rise = float(residual @ residual) - best.cost
+        out += [point] if rise <= most and tracker.objective.failures == failures else []
     inverse = np.linalg.pinv(best.scaled.T @ best.scaled, rcond=1e-12, hermitian=True)
-    for column, sign in product(range(len(best.names)), (-1.0, 1.0)):
+    for (name, along), side in product(zip(best.names, inverse, strict=True), (0, 1)):
         if tracker.objective.evaluations < allowed:
-            out += _held(refit, column, sign, inverse[column], most)
+            out += _held(Refit(best, tracker, name), side, along * best.sizes, most)
     return out
 
 
@@ -77,16 +80,16 @@ def left_open(
         return Open()
     allowed = tracker.objective.evaluations + budget
     points = alike(best, minima, tracker, budget)
-    refit, further = Refit(best, tracker), []
+    refit, further = Refit(best, tracker), list[Array]()
     for point in points[1:] if descents else ():
         new = not any(point is other for other in minima)
         if new and tracker.objective.evaluations < allowed:
-            found = refit.run(point, iterations=DESCENT)
-            further += [] if found is None else [found.point]
+            found = refit.descend(refit.space.encode(point), refit.box, DESCENT)
+            further.append(refit.values(found))
     values = np.array(points)[:, best.places] + 0.0  # turns -0 into 0
     values = np.concatenate([values, _with_other_zeros(best)])
     ends = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
-    lower = best.cost - tracker.best_cost > BETTER * refit.enough / ENOUGH
+    lower = best.cost - tracker.best_cost > BETTER * refit.least / ENOUGH
     better = tracker.best_values if lower else None
     return Open(dict(zip(best.names, ends, strict=True)), tuple(further), better)
 
@@ -101,22 +104,25 @@ def _with_other_zeros(best: BestPoint) -> Array:
     return np.asarray(np.clip(best.values[best.places] + sides, *best.box))
 
 
-def _held(refit: Refit, column: int, sign: float, along: Array, most: float) -> list[Array]:
-    """Refit with one parameter fixed as far from its best value as the rise `most` allows."""
-    best = refit.best
-    size, value = best.sizes[column], best.values[best.places[column]]
+def _held(refit: Refit, side: int, along: Array, most: float) -> list[Array]:
+    """Refit with one parameter fixed as far to one side as the rise `most` allows.
+
+    `along` is the step (SI) of all parameters that raises the linear cost by the scaled one of it.
+    """
+    best, name, column = refit.best, refit.name, refit.best.names.index(refit.name)
+    size, value, refit.least = best.sizes[column], best.value(name), 0.01 * most
     if not along[column] > 0.0:
         return []
-    limit = float(best.box[int(sign > 0.0), column])
-    shift = min(math.sqrt(most * along[column]), abs(limit - value) / size)
+    shift = min(math.sqrt(most * along[column] * size), abs(best.limits(name)[side] - value))
     for _ in range(TRIALS if shift > 0.0 else 0):
-        point = refit.moved(best.values, sign * shift * along / along[column])
-        hold = (column, value + sign * shift * size)
-        found = refit.run(point, hold, iterations=ITERATIONS)
-        rise = math.inf if found is None else found.cost - best.cost
-        if found is not None and rise <= most:
-            return [found.point]
-        shift *= nearer(most, rise, 0.8)
+        moved, sign = best.values.copy(), 1.0 if side else -1.0
+        steps = sign * shift * along / along[column]
+        moved[best.places] = np.clip(moved[best.places] + steps, *best.box)
+        held = np.where(refit.held, value + sign * shift, refit.box)
+        found = refit.descend(refit.space.encode(moved), held, ITERATIONS)
+        if found.cost - best.cost <= most:
+            return [refit.values(found)]
+        shift *= nearer(most, found.cost - best.cost, 0.8)
     return []
 
 
