@@ -255,15 +255,22 @@ def test_the_result_says_what_was_decided(tmp_path):
     assert all(line.replace("'", "&#39;") in report for line in RULE)
 
 
-def test_there_is_no_range_where_the_law_follows_the_curves():
+@pytest.mark.parametrize("friction", [0.0, 0.01])
+def test_there_is_no_range_where_the_law_follows_the_curves(friction):
     rng = np.random.default_rng(0)
     curves = law_error.curves("own law")
-    stress = curves.stress + 0.005 * np.ptp(curves.stress) * rng.standard_normal(501)
+    rubs = friction * np.sign(np.gradient(curves.displacement))
+    stress = curves.stress + np.ptp(curves.stress) * (rubs + 0.005 * rng.standard_normal(501))
     test = replace(
         micro(None), stress=stress, time=curves.time, displacement=curves.displacement,
         specimen=Specimen(curves.height, curves.area),
     )  # fmt: skip
     result = ff.fit(test, starts=4)
+    if friction:
+        found = BestPoint(result.problem, result.problem.vector()).friction
+        assert found[0] == pytest.approx(friction * np.ptp(curves.stress), rel=0.3)
+        assert any("as by friction" in warning for warning in result.warnings)
+        return
     assert all(item.range is None for item in result.parameters.values())
     assert result.noise["stress_strain"]["law_error"] is None
     report = readable("s1_kc", result.parameters["s1_kc"])

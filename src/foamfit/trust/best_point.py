@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
 from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
@@ -29,10 +30,11 @@ from foamfit.fitting.together import Together
 from foamfit.trust import covariance
 from foamfit.trust.covariance import Block, Covariance, Ends, Uncertainty
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
-from foamfit.trust.residuals.noise_process import basis_of
+from foamfit.trust.residuals.noise_process import basis_of, parts
 
 # Largest leverage of a cycle along a direction; at 1 its residual would be zero there.
 MOST_TAKEN = 0.99
+LOADED = 0.02  # share of the peak stress above which a specimen is under load
 
 
 class Error(NamedTuple):
@@ -225,6 +227,44 @@ class BestPoint:
         """Parameters that are determined or weak by their local interval."""
         known = np.flatnonzero(self.halves <= covariance.NOTHING * self.sizes)
         return [self.names[i] for i in known]
+
+    def with_effect(self, column: Array, size: float) -> tuple[float, Array] | None:
+        """Return the size of an omitted effect, and all parameters with it, by a linear step.
+
+        `column` is the derivative of the residual by the effect, `size` its scale. None unless the
+        effect exceeds four standard errors and lowers χ² by at least a fifth.
+        """
+        sure = np.isfinite(self.spread.stderr)
+        jacobian = np.column_stack([self.jacobian[:, sure], column])
+        sizes = np.append(self.sizes[sure], size)
+        move = sizes * np.linalg.lstsq(jacobian * sizes, -self.residual, rcond=1e-10)[0]
+        left = self.residual + jacobian @ move
+        if left @ left >= 0.8 * self.cost:
+            return None
+        error = covariance.covariance(jacobian, left, self.problem.objective.sizes, sizes).stderr
+        values = self.values.copy()
+        at, (low, high) = self.places[sure], self.box[:, sure]
+        values[at] = np.clip(values[at] + move[:-1], low, high)
+        return (float(move[-1]), values) if abs(move[-1]) > 4.0 * error[-1] else None
+
+    @cached_property
+    def friction(self) -> tuple[float, Array] | None:
+        """Friction in the rig (Pa) that the residuals of a driven test show, and all parameters.
+
+        It adds to the stress on loading and subtracts from it on unloading; see `with_effect`.
+        """
+        objective, test = self.problem.objective, self.problem.measurement
+        curve = next((name for name in objective.counted if name.startswith("stress")), None)
+        if not objective.driven or test.displacement is None or curve is None or not self.misfits:
+            return None
+        assert test.stress is not None
+        least = LOADED * float(test.stress.max())
+        speed = gaussian_filter1d(test.displacement, max(test.stress.size / 200, 1.0), order=1)
+        rubs = np.sign(speed) * (test.stress > least) * objective.factor(curve)
+        column = np.zeros(self.residual.size)
+        column[parts(objective.sizes)[objective.counted.index(curve)]] = rubs[objective.kept[curve]]
+        found = self.with_effect(column, least)
+        return found if found is not None and found[0] > 0.0 else None
 
     def rises(self, residual: Array) -> Array:
         """Return the rise of the cost at another point as the χ² of each parameter, (k,)."""

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from foamfit.arrays import Array
 from foamfit.data.calibration import Contradiction
 from foamfit.data.energy import EnergyAudit
 from foamfit.data.measurement import ASKED, INTEGRATED, is_clipped
@@ -102,7 +101,7 @@ def make_checklist(
         *_recovery(best),
         *_of_test(best, balance, contradictions),
         _time_shift(best, estimates, contradictions),
-        _damping(best, with_error),
+        _damping(best),
     )
     by_key = {check.key: check for check in checks}
     return tuple(by_key[key] for key in SENTENCES["check"] if key in by_key)
@@ -307,16 +306,21 @@ def _of_test(
     yield _check("energy", answer, warnings=warnings, taken=absorbed)
 
 
-def _damping(best: BestPoint, with_error: Sequence[str]) -> Check:
-    """Check whether a driven single spring clearly lacks the damping (Pa·s) that was left out."""
+def _damping(best: BestPoint) -> Check:
+    """Check whether a driven single spring clearly lacks the damping (Pa·s) that was left out.
+
+    Friction in the rig (Pa) looks much like it.
+    """
     problem, name = best.problem, "s1_eta"
     if problem.objective.drive == "impact" or not best.names:
         return _check("damping", None)
     damper, alone, eta = problem.params[name], len(problem.model.kinds) == 1, 0.0
     if alone and problem.measurement.time is not None and not damper.vary and damper.value == 0.0:
         column = problem.slopes(best.values, (name,))[:, 0]
-        eta = max(_one_step(best, with_error, column, best.size(name)) or 0.0, 0.0)
-    return _check("damping", eta == 0.0, eta=eta)
+        found = best.with_effect(column, best.size(name))
+        eta = max(found[0], 0.0) if found else 0.0
+    rubs = best.friction[0] if best.friction else 0.0
+    return _check("damping", eta == rubs == 0.0, eta=eta, friction=rubs)
 
 
 def lost_height(best: BestPoint) -> float:
@@ -371,22 +375,3 @@ def _time_shift(best: BestPoint, estimates: Estimates, found: Sequence[Contradic
             check_time_shift(test, drive)
             fine = True
     return _check("time_shift", fine or None, **facts)
-
-
-def _one_step(
-    best: BestPoint, with_error: Sequence[str], column: Array, size: float
-) -> float | None:
-    """Estimate an omitted parameter by a linear step of it and of all parameters `with_error`.
-
-    `column` is the derivative of the residual by the parameter, `size` its scale. Returns None
-    unless the estimate exceeds four standard errors and the step lowers χ² by at least a fifth.
-    """
-    problem, residual = best.problem, best.residual
-    jacobian = np.column_stack([best.jacobian[:, [*map(best.names.index, with_error)]], column])
-    sizes = np.append(problem.sizes(tuple(with_error), best.values), size)
-    move = sizes * np.linalg.lstsq(jacobian * sizes, -residual, rcond=1e-10)[0]
-    left = residual + jacobian @ move
-    if left @ left >= 0.8 * float(residual @ residual):
-        return None
-    spread = covariance(jacobian, left, problem.objective.sizes, sizes)
-    return float(move[-1]) if abs(move[-1]) > 4.0 * spread.stderr[-1] else None

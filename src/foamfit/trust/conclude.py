@@ -26,7 +26,7 @@ from foamfit.parts import ParameterEstimate
 from foamfit.results import Correlation, Curves, Fit, Intervals, Switch
 from foamfit.solve.cache import SPENT
 from foamfit.springs import laws
-from foamfit.springs.parameters import any_param, split_name, unit_of
+from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 from foamfit.text import engineering, listed
 from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
@@ -45,6 +45,7 @@ from foamfit.trust.residuals.law_error import CurveError
 
 # If an interval and the local one differ by more than this factor, the local one is misleading.
 ASTRAY = 2.0
+SHORT = 0.8  # share of the change by friction that a linear step finds, in synthetic records
 CLOSE = 0.9  # smallest correlation that is named
 UNDER = 0.05  # share of the peak stress, above which a record ends under load
 CLOSED = 0.005  # area of a loop over peak stress times largest strain, below which it is closed
@@ -368,8 +369,10 @@ def _varied(
     zero = problem.measurement.origins.get(name, 0.0)  # in the numbers of the file
     if (there := intervals.elsewhere.get(name)) is not None:
         there += zero
-    if state == "determined" and (there is not None or any({**doubts, "curve": ""}.values())):
-        state, why = "weak", say("why", "weak", why=why, unit=unit, there=there, **doubts)
+    own = {"there": there, "rubbed": _rubbed(best, name)}
+    doubted = any({**doubts, "curve": ""}.values()) or any(x is not None for x in own.values())
+    if state == "determined" and doubted:
+        state, why = "weak", say("why", "weak", why=why, unit=unit, **own, **doubts)
     state, why = judged(settled, best, name, (ends[0] + zero, ends[1] + zero), (state, why))
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
@@ -379,6 +382,15 @@ def _varied(
     why = say("why", "interval", why=why, doubtful=doubtful, stalled=stalled, astray=astray)
     ci95, stderr = (max(ends[0], low), min(ends[1], high)), float(best.spread.stderr[column])
     return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method, span)
+
+
+def _rubbed(best: BestPoint, name: str) -> float | None:
+    """Return the value with friction in the rig if it is far from the fitted one, else None."""
+    if best.friction is None or name in NUISANCE:
+        return None
+    value, there = best.value(name), float(best.friction[1][best.index[name]])
+    far = abs(there - value) > SHORT * covariance.WEAK * min(best.size(name), abs(there))
+    return there if far else None
 
 
 def _state_of(

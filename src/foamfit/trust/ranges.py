@@ -2,7 +2,7 @@
 
 With model error, the best point depends on the weights of the samples and on the minimum that the
 search finds. The range of a parameter is the hull of its values over points that follow the curves
-about as well.
+about as well, among them one with friction in the rig if the residuals show it.
 """
 
 from __future__ import annotations
@@ -88,6 +88,8 @@ def left_open(
             further.append(refit.values(found))
     values = np.array(points)[:, best.places] + 0.0  # turns -0 into 0
     values = np.concatenate([values, _with_other_zeros(best)])
+    if best.friction is not None:
+        values = np.concatenate([values, best.friction[1][None, best.places]])
     ends = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
     lower = best.cost - tracker.best_cost > BETTER * refit.least / ENOUGH
     better = tracker.best_values if lower else None
