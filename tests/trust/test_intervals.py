@@ -3,6 +3,7 @@
 import csv
 import importlib.util
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -209,28 +210,29 @@ def test_the_ends_of_a_profile_satisfy_the_cut_by_an_independent_refit(impact):
         assert rise == pytest.approx(found.cut, rel=0.06)
 
 
-@pytest.mark.parametrize("method", ["auto", "profile"])
-def test_an_interval_goes_on_to_a_minimum_that_is_as_good(method):
-    """The cost x² (x-3)² has two minima; its residual is x (x-3), the other samples are noise."""
-    noise = np.random.default_rng(0).standard_normal(400)
+def origin(seed: int, two: Callable[..., Any], slopes: Callable[..., Any]) -> BestPoint:
+    """Return the point a = b = 0 of a cost of `two` residuals over 1/30, and 398 of noise."""
+    noise = np.random.default_rng(seed).standard_normal(400)
     noise[:2] = 0.0
 
     class Two(Curve):
         def residual(self, values: np.ndarray) -> np.ndarray:
-            out = self.data.copy()
-            out[0] += 30.0 * values[1] * (values[1] - 3.0)
-            out[1] += 30.0 * values[0]
-            return out
+            return np.append(30.0 * np.array(two(*values)), self.data[2:])
 
     class TwoBench(Bench):
         def slopes(self, values: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-            out = np.zeros((400, 2))
-            out[0, 1] = 30.0 * (2.0 * values[1] - 3.0)
-            out[1, 0] = 30.0
-            return out
+            return np.append(30.0 * np.array(slopes(*values)), np.zeros((398, 2)), axis=0)
 
     bench = TwoBench(Two(np.arange(400.0), noise))
-    around = BestPoint(bench, np.zeros(2), ("a", "b"))  # type: ignore[arg-type]
+    return BestPoint(bench, np.zeros(2), ("a", "b"))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("method", ["auto", "profile"])
+def test_an_interval_goes_on_to_a_minimum_that_is_as_good(method):
+    """The cost x² (x-3)² has two minima; its residual is x (x-3), the other samples are noise."""
+    around = origin(
+        0, lambda a, b: (b * (b - 3.0), a), lambda a, b: ((0.0, 2.0 * b - 3.0), (1.0, 0.0))
+    )
     low, high = around.local("b")
     found = assess(around, Choice(method), minima=[np.array([0.0, 3.0])])
     assert found.ends["b"] == pytest.approx((low, 3.0 + high), rel=0.05)
@@ -243,27 +245,15 @@ def test_a_value_far_outside_that_fits_almost_as_well_is_named(far):
 
     There the best a changes with b, so that a refit with a fixed does not find these values of b.
     """
-    noise = np.random.default_rng(2).standard_normal(400)
-    noise[:2] = 0.0
 
-    class Shelf(Curve):
-        def residual(self, values: np.ndarray) -> np.ndarray:
-            out = self.data.copy()
-            beyond = max(values[1] - 0.08, 0.0) if far else 0.0
-            out[0] += 30.0 * (values[0] - 10.0 * beyond)
-            out[1] += 30.0 * (values[1] - beyond)
-            return out
+    def two(a: float, b: float) -> tuple[float, float]:
+        beyond = max(b - 0.08, 0.0) if far else 0.0
+        return a - 10.0 * beyond, b - beyond
 
-    class ShelfBench(Bench):
-        def slopes(self, values: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-            out = np.zeros((400, 2))
-            beyond = far and values[1] > 0.08
-            out[0] = 30.0, -300.0 * beyond
-            out[1, 1] = 30.0 * (not beyond)
-            return out
+    def slopes(a: float, b: float) -> tuple[tuple[float, float], ...]:
+        return ((1.0, -10.0), (0.0, 0.0)) if far and b > 0.08 else ((1.0, 0.0), (0.0, 1.0))
 
-    bench = ShelfBench(Shelf(np.arange(400.0), noise))
-    found = assess(BestPoint(bench, np.zeros(2), ("a", "b")), Choice())  # type: ignore[arg-type]
+    found = assess(origin(2, two, slopes), Choice())
     half = 1.966 / 30.0
     assert found.ends == {}
     there = {"a": 10.0 * (3.0 * half - 0.08), "b": 3.0 * half} if far else {}

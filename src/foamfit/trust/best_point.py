@@ -228,6 +228,15 @@ class BestPoint:
         known = np.flatnonzero(self.halves <= covariance.NOTHING * self.sizes)
         return [self.names[i] for i in known]
 
+    def added(self, curve: str, values: Array) -> Array:
+        """Return the change of the residual by `values` added to a simulated curve, (n_data,)."""
+        objective, out = self.problem.objective, np.zeros(self.residual.size)
+        part = parts(objective.sizes)[objective.counted.index(curve)]
+        out[part] = objective.factor(curve) * values[objective.kept[curve]]
+        if objective.weighing is not None:
+            out[: objective.n_data] = objective.weighing(out[: objective.n_data])
+        return out
+
     def with_effect(self, column: Array, size: float) -> tuple[float, Array] | None:
         """Return the size of an omitted effect, and all parameters with it, by a linear step.
 
@@ -260,10 +269,8 @@ class BestPoint:
         assert test.stress is not None
         least = LOADED * float(test.stress.max())
         speed = gaussian_filter1d(test.displacement, max(test.stress.size / 200, 1.0), order=1)
-        rubs = np.sign(speed) * (test.stress > least) * objective.factor(curve)
-        column = np.zeros(self.residual.size)
-        column[parts(objective.sizes)[objective.counted.index(curve)]] = rubs[objective.kept[curve]]
-        found = self.with_effect(column, least)
+        rubs = np.sign(speed) * (test.stress > least)
+        found = self.with_effect(self.added(curve, rubs), least)
         return found if found is not None and found[0] > 0.0 else None
 
     def rises(self, residual: Array) -> Array:
@@ -410,6 +417,22 @@ class JointPoint:
         share, axes = np.linalg.eigh(left @ left.T)
         own = self.uncertainty.blocks[test].axes[0]
         return np.asarray((own @ axes) * np.sqrt(np.clip(share, 0.0, 1.0)))
+
+    def scale(self, test: int) -> tuple[float, float]:
+        """Return the factor of a test's force that lowers the cost most, and the share it lowers.
+
+        It is a score test: a linear step of this factor and of all unknowns, without a further fit.
+        """
+        best, block, left = self.bests[test], self.uncertainty.blocks[test], self.uncertainty.lefts
+        curve = next((n for n in best.problem.objective.counted if n.startswith("stress")), None)
+        if curve is None:
+            return 1.0, 0.0
+        column = -best.added(curve, best.problem.objective.measured[curve])
+        taken = left[test].T @ (block.axes[0].T @ column)
+        free, slope = float(column @ column - taken @ taken), float(column @ best.residual)
+        if free <= 1e-6 * float(column @ column):
+            return 1.0, 0.0
+        return 1.0 - slope / free, slope**2 / free / max(self.found.cost, 1e-300)
 
     @cached_property
     def _undrawn(self) -> tuple[Array, Array]:

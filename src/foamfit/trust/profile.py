@@ -54,7 +54,7 @@ class Refit:
         best = self.best
         self.space = best.problem.space((self.name,) if self.name else ())
         self.functions = squares(self.tracker, self.space)
-        places = np.array([one.place for one in self.space.coordinates])
+        places = np.array([one.place for one in self.space.coordinates], dtype=np.intp)
         self.held = places == best.index.get(self.name, -1)
         point = np.where(self.held, best.values[places], self.space.encode(best.values))
         self.box = np.where(np.isin(places, best.places), self.space.box, point)
