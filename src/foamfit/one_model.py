@@ -324,8 +324,8 @@ def _search(
     thinned, impact = problem.thinned(), problem.objective.drive == "impact"
     coarse = Tracker(thinned.objective, tracker.deadline, tracker.better, looked=tracker.looked)
 
-    def search_thinned(problem: Problem) -> list[tuple[float, int]]:
-        """Search on the thinned record; its ends become those of the tracker."""
+    def search_thinned(problem: Problem) -> tuple[list[tuple[float, int]], list[Array]]:
+        """Search on the thinned record; return the costs and ends of its descents."""
         space = problem.space()
         how: Any = {"rng": rng, "progress": progress, "known": known}
         costs = search.search(coarse, space, starts=record.starts, **how)
@@ -336,28 +336,24 @@ def _search(
         if coarse.best_cost < (1.0 - search.NEWS) * reached:
             search.leave_minimum(coarse, space, new=not known)
         best = [] if coarse.best_values is None else [coarse.best_values]
-        tracker.ends += [*best, *coarse.ends]
-        return costs
+        return costs, [*best, *coarse.ends]
 
-    def search_held() -> None:
-        """Search with contact and zeros held, unless the first search did that."""
+    def search_held() -> list[Array]:
+        """Search with contact and zeros held, unless the first search did that; return the ends."""
         if early:
-            tracker.ends += early
-        else:
-            coarse.best_values, coarse.best_cost, coarse.ends = None, np.inf, []
-            search_thinned(settle.held_by_record(thinned, asked))
+            return early
+        coarse.best_values, coarse.best_cost, coarse.ends = None, np.inf, []
+        return search_thinned(settle.held_by_record(thinned, asked))[1]
 
     try:
-        costs = search_thinned(thinned if impact else settle.held_by_record(thinned, asked))
+        first = thinned if impact else settle.held_by_record(thinned, asked)
+        costs, tracker.ends = search_thinned(first)
         record = replace(record, costs=tuple(costs))
         early += [] if impact else tracker.ends
         progress(search.REFINED, "refinement")
         settle.descend_again(problem, tracker)
-        problem, freed = settle.keep_to_record(problem, tracker, asked, search_held)
-        record = replace(record, freed=freed)
-        problem = settle.free_zero(problem, tracker, given)
-        problem = settle.weigh_priors(problem, tracker)
-        settle.weigh_motion(problem, tracker)
+        for step, freed in settle.steps(problem, tracker, asked, given, search_held):
+            problem, record = step, replace(record, freed=freed)
         settle_ends(tracker, problem.space())
     except STOPPING as error:
         if tracker.best_values is None and coarse.best_values is not None:

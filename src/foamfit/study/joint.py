@@ -31,8 +31,7 @@ from foamfit.study.joint_fit import Vectors, fit_jointly
 from foamfit.study.joint_result import Alternative, JointResult, result_of
 from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
-from foamfit.trust import covariance
-from foamfit.trust.settle import keep_to_record, weigh_motion, weigh_priors
+from foamfit.trust import covariance, settle
 
 # Number of tests fitted by a full search; the others start at the results of these.
 SEARCHED = 3
@@ -274,9 +273,7 @@ def _own_fit(test: _Test, model: str, options: Options, near: tuple[Array, ...])
         tracker.ends.append(space.decode(end))
     if tracker.best_values is None:
         return _own_fit(test, model, options, ())
-    problem, _ = keep_to_record(problem, tracker, options.vary)
-    problem = weigh_priors(problem, tracker)
-    weigh_motion(problem, tracker)
+    *_, (problem, _) = settle.steps(problem, tracker, options.vary, params)
     return test.fitted(problem, tracker, tracker.best_values)
 
 

@@ -16,7 +16,6 @@ from functools import partial
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.calibration import contradictions
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import is_logarithmic
 from foamfit.fitting.links import RATES, Links
@@ -29,7 +28,7 @@ from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 from foamfit.text import counted
 from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, Error, JointPoint
-from foamfit.trust.budget import judged, settle, unsettled
+from foamfit.trust.budget import judged, settle
 from foamfit.trust.covariance import Ends
 from foamfit.trust.intervals import FAR, HARDLY_WORSE
 from foamfit.trust.profile import PLACED
@@ -274,7 +273,7 @@ def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, ParameterE
         if any(name in one.index and not one.is_exact(name) for one in problems)
     }
     for test, best in zip(tests, fit.point.bests, strict=True):
-        settled = settle(best, unsettled(best, contradictions(best.problem.measurement)))
+        settled = settle(best, best.contradictions)
         for name in best.problem.free() if settled else ():
             found[name] = _contested(found[name], test, partial(judged, settled, best, name))
     return found
@@ -369,7 +368,7 @@ def _judged(
     far = [x for x in near if max(ends[0] - x, x - ends[1]) > FAR * np.ptp(ends)]
     if state == "determined" and far:
         there = far[0] + problem.measurement.origins.get(name, 0.0)
-        state, why = "weak", say("why", "elsewhere", why=why, unit=unit, there=there)
+        state, why = "weak", say("why", "weak", why=why, unit=unit, there=there)
     one = replace(_BLANK, value=value, unit=unit, state=state, why=why, range=span)
     if not np.ptp(ends) <= 2.0 * covariance.NOTHING * size:
         return one

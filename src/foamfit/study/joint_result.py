@@ -15,7 +15,6 @@ import numpy as np
 from foamfit.api import FitResult
 from foamfit.arrays import Array
 from foamfit.codec import plain
-from foamfit.data.calibration import contradictions
 from foamfit.data.measurement import ASKED
 from foamfit.data.zeros import CONTRADICTED
 from foamfit.fitting.links import RATES
@@ -38,7 +37,6 @@ from foamfit.study.joint_fit import LARGEST, JointFit, parameters_of
 from foamfit.study.study_file import Study
 from foamfit.text import counted, number
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.budget import unsettled
 from foamfit.trust.checklist import POOR, UNACCEPTABLE, status_of, warnings_of
 from foamfit.trust.conclude import conclude, noise_of
 from foamfit.trust.covariance import RULE, Ends
@@ -409,8 +407,7 @@ def _with_words(
         for note in measurement.notes:
             if note.startswith(ASKED) and CONTRADICTED not in note:
                 doubts.setdefault(note.removeprefix(ASKED).strip(), []).append(test)
-        found = unsettled(best, contradictions(measurement))
-        wrong += [(test, each, objective.drive) for each in found]
+        wrong += [(test, each, objective.drive) for each in best.contradictions]
         for curve in objective.counted:
             misfit, measured = one.misfit[curve], objective.measured[curve]
             if misfit is None or not misfit <= UNACCEPTABLE * np.std(measured) / np.ptp(measured):

@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from foamfit.arrays import Array
+from foamfit.data.calibration import Contradiction, contradictions
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import is_velocity
 from foamfit.fitting.branches import silent, unreached
 from foamfit.fitting.links import RATES, factor
-from foamfit.fitting.nuisance import CONTACT_TIME, open_zero
+from foamfit.fitting.nuisance import CONTACT_TIME, POSITIVE, TIME_SHIFT, open_zero
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Together
@@ -160,6 +161,31 @@ class BestPoint:
             motion = "displacement_time"
             slow = {i for i, curve in enumerate(objective.counted) if every or curve == motion}
         return self.residual, self.scaled, objective.sizes, taken, slow
+
+    @cached_property
+    def contradictions(self) -> tuple[Contradiction, ...]:
+        """Numbers that the record contradicts and that the fit does not settle.
+
+        It settles them by a parameter or its value; of a time shift, only what is left counts.
+        """
+        problem, usual = self.problem, self.problem.objective.usual
+        values = usual | dict(zip(problem.names, self.values.tolist(), strict=True))
+        free = set(problem.free()) - {prior.name for prior in problem.objective.priors}
+        speed, mass, scale = (values[name] / usual[name] for name in POSITIVE)
+        settling = {"velocity": (speed,), "force_scale": (scale / mass,)}
+        # Between masses within the specimen the force is late without a fault of the clocks.
+        inert = problem.objective.interior_mass and len(problem.model.kinds) > 1
+        out = list[Contradiction]()
+        for one in contradictions(problem.measurement):
+            if one.quantity == TIME_SHIFT:
+                one = replace(one, ratio=one.ratio - values[TIME_SHIFT])
+                agrees = inert or abs(one.ratio) <= one.limit
+            else:
+                ratios = settling.get(one.quantity, (1.0 / speed, mass / scale))
+                agrees = all(abs(one.ratio / ratio - 1.0) <= one.limit for ratio in ratios)
+            if not (agrees or one.is_settled(free)):
+                out.append(one)
+        return tuple(out)
 
     @property
     def misfits(self) -> bool:

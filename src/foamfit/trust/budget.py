@@ -233,31 +233,6 @@ class Settled:
     values: Array | None
 
 
-def unsettled(best: BestPoint, found: Sequence[Contradiction]) -> tuple[Contradiction, ...]:
-    """Return the contradictions that the fit does not settle by a parameter or its value.
-
-    Of a time shift, only what the fit leaves of it.
-    """
-    problem, usual = best.problem, best.problem.objective.usual
-    values = usual | dict(zip(problem.names, best.values.tolist(), strict=True))
-    free = set(problem.free()) - {prior.name for prior in problem.objective.priors}
-    speed, mass, scale = (values[name] / usual[name] for name in nuisance.POSITIVE)
-    settling = {"velocity": (speed,), "force_scale": (scale / mass,)}
-    # Between masses within the specimen the force is late without a fault of the clocks.
-    inert = problem.objective.interior_mass and len(problem.model.kinds) > 1
-    out = list[Contradiction]()
-    for one in found:
-        if one.quantity == nuisance.TIME_SHIFT:
-            one = replace(one, ratio=one.ratio - values[nuisance.TIME_SHIFT])
-            agrees = inert or abs(one.ratio) <= one.limit
-        else:
-            ratios = settling.get(one.quantity, (1.0 / speed, mass / scale))
-            agrees = all(abs(one.ratio / ratio - 1.0) <= one.limit for ratio in ratios)
-        if not (agrees or one.is_settled(free)):
-            out.append(one)
-    return tuple(out)
-
-
 def of_flight(best: BestPoint) -> tuple[Contradiction, ...]:
     """Return what the flight shows of a velocity that differs by less than a contradiction."""
     test = best.problem.measurement

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from foamfit.data.calibration import Contradiction
 from foamfit.data.energy import EnergyAudit
 from foamfit.data.measurement import ASKED, INTEGRATED, is_clipped
 from foamfit.data.zeros import CONTRADICTED
@@ -82,12 +81,8 @@ def make_checklist(
     record: SearchRecord,
     balance: EnergyAudit,
     intervals: Intervals,
-    contradictions: Sequence[Contradiction] = (),
 ) -> tuple[Check, ...]:
-    """Answer all questions, in the order of `sentences.toml`.
-
-    `contradictions` are those of the balance that the fit does not settle.
-    """
+    """Answer all questions, in the order of `sentences.toml`."""
     with_error = [name for name in best.names if estimates[name].stderr is not None]
     checks = (
         *_of_search(best, record),
@@ -99,8 +94,8 @@ def make_checklist(
         *_of_intervals(best, estimates, intervals, with_error),
         *_of_priors(best, estimates, with_error),
         *_recovery(best),
-        *_of_test(best, balance, contradictions),
-        _time_shift(best, estimates, contradictions),
+        *_of_test(best, balance),
+        _time_shift(best, estimates),
         _damping(best),
     )
     by_key = {check.key: check for check in checks}
@@ -277,17 +272,15 @@ def _of_priors(best: BestPoint, estimates: Estimates, with_error: Sequence[str])
         yield _check("priors", not against, against=against)
 
 
-def _of_test(
-    best: BestPoint, balance: EnergyAudit, contradictions: Sequence[Contradiction]
-) -> Iterator[Check]:
+def _of_test(best: BestPoint, balance: EnergyAudit) -> Iterator[Check]:
     test, drive = best.problem.measurement, best.problem.objective.drive
     small = [note for note in test.notes if CONTRADICTED in note]
     doubts = [note for note in test.notes if note.startswith(ASKED) and note not in small]
     told: dict[bool, list[str]] = {True: [], False: []}
-    for one in (one for one in contradictions if one.quantity != "time_shift"):
+    for one in (one for one in best.contradictions if one.quantity != "time_shift"):
         sentence = say("contradiction", "said", one=one, drive=drive)
         told[one.quantity == "force_scale"].append(sentence)
-    settled = len(contradictions) < len(balance.contradictions)
+    settled = len(best.contradictions) < len(balance.contradictions)
     ratio, absorbed = balance.impulse_ratio, balance.absorbed_over_striker
     said = any(one.quantity != "time_shift" for one in balance.contradictions)
     wrong = told[False] or (small if drive == "impact" and not said else [])
@@ -355,9 +348,9 @@ def _recovery(best: BestPoint) -> Iterator[Check]:
         yield _check("recovery", False, lost=lost)
 
 
-def _time_shift(best: BestPoint, estimates: Estimates, found: Sequence[Contradiction]) -> Check:
+def _time_shift(best: BestPoint, estimates: Estimates) -> Check:
     """Check what the equation of motion of the striker says of the clocks (`data.calibration`)."""
-    test, drive = best.problem.measurement, best.problem.objective.drive
+    test, drive, found = best.problem.measurement, best.problem.objective.drive, best.contradictions
     fitted, striker = best.problem.objective.time_shift, test.striker
     shift = estimates.get("time_shift") if fitted else None
     held = fitted and not (shift and shift.vary)

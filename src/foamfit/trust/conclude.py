@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from foamfit.data.calibration import contradictions
 from foamfit.data.cycles import inner_loops
 from foamfit.data.energy import audit, noise_sentences
 from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel
@@ -30,7 +29,7 @@ from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 from foamfit.text import engineering, listed
 from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
-from foamfit.trust.budget import Settled, changed, judged, make_budget, of_flight, settle, unsettled
+from foamfit.trust.budget import Settled, changed, judged, make_budget, of_flight, settle
 from foamfit.trust.checklist import (
     POOR,
     lost_height,
@@ -63,12 +62,10 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
     late = best.value(TIME_SHIFT) if objective.time_shift else 0.0
     on_time = changed(measurement, TIME_SHIFT, late) if late else measurement
     balance, misfit = audit(on_time), objective.misfit(simulated)
-    found = contradictions(measurement) if late else balance.contradictions
-    contradicted = unsettled(best, found)
-    settled = settle(best, contradicted or of_flight(best))
+    settled = settle(best, best.contradictions or of_flight(best))
     doubts = _doubts(best, record, intervals)
     estimates, budget = make_budget(best, _estimates(best, insight, intervals, settled, doubts))
-    checklist = make_checklist(best, estimates, misfit, record, balance, intervals, contradicted)
+    checklist = make_checklist(best, estimates, misfit, record, balance, intervals)
     springs = best.values[: len(problem.model.names)]
     return Fit(
         measurement=measurement,
@@ -80,7 +77,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         chain=problem.model.chain(springs, specimen.height, specimen.area),
         params=problem.told(),
         parameters=estimates,
-        contradictions=contradicted,
+        contradictions=best.contradictions,
         visited=visited(problem, simulated),
         misfit=misfit,
         weights=objective.weights,

@@ -9,7 +9,7 @@ fit that then follows the record worse returns to that optimum (`weigh_motion`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator, Sequence
 from copy import copy
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ from foamfit.fitting import levenberg
 from foamfit.fitting.curves import history
 from foamfit.fitting.nuisance import shown_by
 from foamfit.fitting.problem import Problem
-from foamfit.fitting.search import STOPPING, Freed, Tracker, descend, distinct, rank, squares
+from foamfit.fitting.search import Freed, Tracker, descend, distinct, rank, squares
 from foamfit.springs.parameters import NUISANCE
 from foamfit.trust.best_point import BestPoint
 
@@ -74,48 +74,69 @@ def descend_again(problem: Problem, tracker: Tracker) -> None:
     refine(problem, tracker)
 
 
+def steps(
+    problem: Problem,
+    tracker: Tracker,
+    asked: Collection[str],
+    given: Collection[str],
+    search_held: Callable[[], Sequence[Array]] = tuple,
+) -> Iterator[tuple[Problem, Freed | None]]:
+    """Decide what stays free and weigh the residuals, with descents from the ends of the search.
+
+    Yields the problem after each step, and what `keep_to_record` found. Nuisance parameters that
+    the user has `asked` to vary, or has `given`, stay as they are.
+    """
+    problem, freed = keep_to_record(problem, tracker, asked, search_held)
+    yield problem, freed
+    problem = free_zero(problem, tracker, given)
+    yield problem, freed
+    problem = weigh_priors(problem, tracker)
+    yield problem, freed
+    weigh_motion(problem, tracker)
+
+
 def keep_to_record(
     problem: Problem,
     tracker: Tracker,
     asked: Collection[str],
-    search_held: Callable[[], object] = lambda: None,
+    search_held: Callable[[], Sequence[Array]] = tuple,
 ) -> tuple[Problem, Freed | None]:
     """Hold contact and zeros where the record shows them, if the law errs more than the noise.
 
-    `search_held` searches without them; then descents begin from the ends of all searches.
+    `search_held` searches without them and returns the ends; descents begin from those of both.
     """
-    values, cost, found = tracker.best_values, tracker.best_cost, tracker.ends
-    held = held_by_record(problem, asked)
+    values, held = tracker.best_values, held_by_record(problem, asked)
     if values is None or not held.kept or not errs(BestPoint(problem, values)):
         return problem, None
-    tracker.best_values, tracker.best_cost, tracker.ends = None, math.inf, []
-    try:
-        search_held()
-        tracker.ends += [*found, values]
-        descend_again(held, tracker)
-    except STOPPING:
-        tracker.best_values, tracker.best_cost, tracker.ends = values, cost, found
-        raise
-    if tracker.best_values is None:
-        tracker.best_values, tracker.best_cost, tracker.ends = values, cost, found
+    other = _afresh(tracker, [*search_held(), *tracker.ends, values])
+    descend_again(held, other)
+    if other.best_values is None:
         return problem, None
-    if tracker.best_cost < cost:  # the search with these free had missed a minimum
-        free = replace(tracker, ends=[tracker.best_values], best_values=None, best_cost=math.inf)
+    if other.best_cost < tracker.best_cost:  # the search with these free had missed a minimum
+        free = _afresh(tracker, [other.best_values])
         descend_again(problem, free)
         assert free.best_values is not None
-        if not errs(BestPoint(problem, free.best_values)):
-            tracker.best_values, tracker.best_cost = free.best_values, free.best_cost
-            tracker.ends += free.ends
-            return problem, None
         values = free.best_values
-    pairs = zip(problem.names, tracker.best_values.tolist(), values.tolist(), strict=True)
+        if not errs(BestPoint(problem, values)):
+            tracker.best_values, tracker.best_cost = values, free.best_cost
+            tracker.ends += [*other.ends, *free.ends]
+            return problem, None
+    tracker.best_values, tracker.best_cost, tracker.ends = (
+        other.best_values, other.best_cost, other.ends,
+    )  # fmt: skip
+    pairs = zip(problem.names, other.best_values.tolist(), values.tolist(), strict=True)
     springs = {name for name in problem.free() if name not in NUISANCE}
     return held, Freed(
         tuple(held.kept),
-        _misfit(problem, tracker.best_values),
+        _misfit(problem, other.best_values),
         _misfit(problem, values),
         {name: (with_record, without) for name, with_record, without in pairs if name in springs},
     )
+
+
+def _afresh(tracker: Tracker, ends: list[Array]) -> Tracker:
+    """Return a tracker without a best point, with the same limits and other ends."""
+    return replace(tracker, ends=ends, best_values=None, best_cost=math.inf)
 
 
 def free_zero(problem: Problem, tracker: Tracker, given: Collection[str]) -> Problem:
@@ -134,7 +155,7 @@ def free_zero(problem: Problem, tracker: Tracker, given: Collection[str]) -> Pro
     held = BestPoint(freed, values)
     if abs(_zero_by_errors(held, name, step=True)) < SHOWN / 2.0:
         return problem
-    other = replace(tracker, ends=[*tracker.ends, values], best_values=None, best_cost=math.inf)
+    other = _afresh(tracker, [*tracker.ends, values])
     descend_again(freed, other)
     assert other.best_values is not None  # the start can be simulated
     best = BestPoint(freed, other.best_values)
