@@ -83,29 +83,30 @@ class Bench:
 
     objective: Curve
     low: float = -100.0
+    high: float = 100.0
     kept: Any = field(default_factory=dict)  # nothing is held
     index: Any = field(default_factory=lambda: {"a": 0, "b": 1})
 
     @property
     def params(self) -> dict[str, SimpleNamespace]:
-        return {name: SimpleNamespace(min=self.low, max=100.0) for name in "ab"}
+        return {name: SimpleNamespace(min=self.low, max=self.high) for name in self.index}
 
     def sizes(self, names: tuple[str, ...], values: np.ndarray) -> np.ndarray:
         return np.ones(len(names))
 
     def space(self, absolute: tuple[str, ...] = ()) -> Any:
         """Each coordinate is the value of its parameter."""
-        names, same = tuple(self.index), lambda values: values
+        names, same, eye = tuple(self.index), lambda values: values, np.eye(len(self.index))
         self.objective.jacobian_along = lambda values, moves: self.slopes(values, names) @ moves
-        return SimpleNamespace(
-            coordinates=[SimpleNamespace(place=place) for place in self.index.values()],
-            box=np.repeat([[self.low], [100.0]], len(names), axis=1),
-            complete=same, encode=same, decode=same, slopes=lambda *_: np.eye(len(names)),
-        )  # fmt: skip
+        places = [SimpleNamespace(place=place) for place in self.index.values()]
+        by = {"complete": same, "encode": same, "decode": same, "slopes": lambda *_: eye}
+        box = np.repeat([[self.low], [self.high]], len(names), axis=1)
+        return SimpleNamespace(coordinates=places, box=box, **by)
 
     def slopes(self, values: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-        t, b = self.objective.time, values[1]
-        return np.column_stack([np.ones_like(t), t + 2 * self.objective.bend * b * t**2])
+        """Differences, which are exact for parabolas."""
+        model, steps = self.objective.model, np.eye(values.size)[[self.index[n] for n in names]]
+        return np.column_stack([model(values + one) - model(values - one) for one in steps]) / 2.0
 
 
 def curve(
@@ -223,16 +224,14 @@ def origin(seed: int, two: Callable[..., Any], slopes: Callable[..., Any]) -> Be
         def slopes(self, values: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
             return np.append(30.0 * np.array(slopes(*values)), np.zeros((398, 2)), axis=0)
 
-    bench = TwoBench(Two(np.arange(400.0), noise))
-    return BestPoint(bench, np.zeros(2), ("a", "b"))  # type: ignore[arg-type]
+    return BestPoint(TwoBench(Two(np.arange(400.0), noise)), np.zeros(2), ("a", "b"))
 
 
 @pytest.mark.parametrize("method", ["auto", "profile"])
 def test_an_interval_goes_on_to_a_minimum_that_is_as_good(method):
     """The cost x² (x-3)² has two minima; its residual is x (x-3), the other samples are noise."""
-    around = origin(
-        0, lambda a, b: (b * (b - 3.0), a), lambda a, b: ((0.0, 2.0 * b - 3.0), (1.0, 0.0))
-    )
+    slopes = lambda _, b: ((0.0, 2.0 * b - 3.0), (1.0, 0.0))  # noqa: E731
+    around = origin(0, lambda a, b: (b * (b - 3.0), a), slopes)
     low, high = around.local("b")
     found = assess(around, Choice(method), minima=[np.array([0.0, 3.0])])
     assert found.ends["b"] == pytest.approx((low, 3.0 + high), rel=0.05)
@@ -250,10 +249,8 @@ def test_a_value_far_outside_that_fits_almost_as_well_is_named(far):
         beyond = max(b - 0.08, 0.0) if far else 0.0
         return a - 10.0 * beyond, b - beyond
 
-    def slopes(a: float, b: float) -> tuple[tuple[float, float], ...]:
-        return ((1.0, -10.0), (0.0, 0.0)) if far and b > 0.08 else ((1.0, 0.0), (0.0, 1.0))
-
-    found = assess(origin(2, two, slopes), Choice())
+    on, beyond = np.eye(2), np.array([[1.0, -10.0], [0.0, 0.0]])
+    found = assess(origin(2, two, lambda _, b: beyond if far and b > 0.08 else on), Choice())
     half = 1.966 / 30.0
     assert found.ends == {}
     there = {"a": 10.0 * (3.0 * half - 0.08), "b": 3.0 * half} if far else {}
@@ -311,22 +308,11 @@ class Levels(Curve):
         return a + c + b * self.time
 
 
-class LevelsBench(Bench):
-    def slopes(self, values: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-        t = self.objective.time
-        slopes = {"a": np.ones_like(t), "b": t, "c": np.ones_like(t)}
-        return np.column_stack([slopes[name] for name in names])
-
-    @property
-    def params(self) -> dict[str, SimpleNamespace]:
-        return {name: SimpleNamespace(min=-1.0, max=1.0) for name in "abc"}
-
-
 def levels(kind: type[Curve] = Levels, names: tuple[str, ...] = ("a", "b", "c")) -> BestPoint:
     """Return the best point of a curve that does not determine a and c."""
     time = np.linspace(-1, 1, 400)
     data = 0.4 + 0.3 * time + 0.1 * np.random.default_rng(5).standard_normal(400)
-    bench = LevelsBench(kind(time, data), index={"a": 0, "b": 1, "c": 2})
+    bench = Bench(kind(time, data), -1.0, 1.0, index={"a": 0, "b": 1, "c": 2})
     slope, level = np.polyfit(time, data, 1)
     best = np.array([0.5 * level, slope, 0.5 * level])
     return BestPoint(bench, best, names)  # type: ignore[arg-type]

@@ -10,7 +10,8 @@ from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
 from foamfit.fitting.together import fit_linked
 from foamfit.study.joint_fit import errors_of, fit_jointly
-from foamfit.trust.best_point import BestPoint, JointPoint
+from foamfit.trust.best_point import BestPoint
+from foamfit.trust.joint_point import JointPoint
 
 SPRING, WHOLE = synthetic_loop(noise=0.0)
 LOOP = replace(WHOLE, displacement=WHOLE.displacement[::2], stress=WHOLE.stress[::2])

@@ -171,8 +171,7 @@ def truth(problem: Problem) -> np.ndarray:
 
 
 def refitted(problem: Problem, values: np.ndarray, names: tuple[str, ...]) -> BestPoint:
-    around = BestPoint(problem, values, names)
-    refit = Refit(around, Tracker(problem.objective))
+    refit = Refit(BestPoint(problem, values, names), Tracker(problem.objective))
     end = refit.descend(refit.space.encode(values), refit.box, 40)
     return BestPoint(problem, refit.values(end), names)
 

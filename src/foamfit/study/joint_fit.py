@@ -27,10 +27,11 @@ from foamfit.parts import ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 from foamfit.text import counted
 from foamfit.trust import covariance, say
-from foamfit.trust.best_point import BestPoint, Error, JointPoint
+from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import judged, settle
 from foamfit.trust.covariance import Ends
 from foamfit.trust.intervals import FAR, HARDLY_WORSE
+from foamfit.trust.joint_point import Error, JointPoint
 from foamfit.trust.profile import PLACED
 from foamfit.trust.ranges import ITERATIONS, TRIALS, left_open, nearer, tolerance
 from foamfit.trust.residuals.law_error import CurveError, curve_errors

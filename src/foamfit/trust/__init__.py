@@ -1,11 +1,11 @@
 """Uncertainty of the parameters, and which of them the test determines.
 
 After the search, `settle` decides which nuisance parameters stay free, and weighs the residuals.
-`best_point` contains the curves, residuals and slopes at the best point; `residuals` separates
-noise from model error; `covariance` and `intervals` compute the uncertainty due to noise, `ranges`
-that due to model error; `checklist` tests the quality of a fit; `conclude` assembles the result and
-gives each parameter its state. All sentences are in `sentences.toml`. A newcomer may skip
-`profile` and `evidence`.
+`best_point` contains the curves, residuals and slopes at the best point (`joint_point` that of
+several tests); `residuals` separates noise from model error; `covariance` and `intervals` compute
+the uncertainty due to noise, `ranges` that due to model error; `checklist` tests the quality of a
+fit; `conclude` assembles the result and gives each parameter its state. All sentences are in
+`sentences.toml`. A newcomer may skip `profile` and `evidence`.
 """
 
 from __future__ import annotations

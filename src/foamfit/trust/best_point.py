@@ -1,18 +1,15 @@
-"""The best point of one test or several: curves, residual, Jacobian and covariance.
+"""The best point of a fit: curves, residual, Jacobian and covariance.
 
 The uncertainty, checklist and report of a fit all use this; it needs one plain simulation and one
-with sensitivities. The unknowns of several tests are the common ones, then the own parameters of
-each test.
+with sensitivities.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import count
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +20,9 @@ from foamfit.data.calibration import Contradiction, contradictions
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import is_velocity
 from foamfit.fitting.branches import silent, unreached
-from foamfit.fitting.links import RATES, factor
 from foamfit.fitting.nuisance import CONTACT_TIME, POSITIVE, TIME_SHIFT, open_zero
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
-from foamfit.fitting.together import Together
 from foamfit.trust import covariance
 from foamfit.trust.covariance import Block, Covariance, Ends, Uncertainty
 from foamfit.trust.residuals.law_error import CurveError, curve_errors
@@ -36,24 +31,6 @@ from foamfit.trust.residuals.noise_process import basis_of, parts
 # Largest leverage of a cycle along a direction; at 1 its residual would be zero there.
 MOST_TAKEN = 0.99
 LOADED = 0.02  # share of the peak stress above which a specimen is under load
-
-
-class Error(NamedTuple):
-    """Standard error, degrees of freedom, and variance over that under unit white noise."""
-
-    stderr: float
-    freedom: float
-    inflation: float
-
-    @property
-    def quantile(self) -> float:
-        """Student's t of the 95 % interval."""
-        return covariance.half_width(1.0, self.freedom)
-
-    @property
-    def half(self) -> float:
-        """Half of the local 95 % interval."""
-        return self.quantile * self.stderr
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,198 +279,6 @@ class BestPoint:
     def rises(self, residual: Array) -> Array:
         """Return the rise of the cost at another point as the χ² of each parameter, (k,)."""
         return np.asarray((float(residual @ residual) - self.cost) / self.spread.inflation)
-
-
-@dataclass(frozen=True, eq=False)
-class JointPoint:
-    """The best point of a joint fit with its local properties.
-
-    `errors` are those of the curves of each test (`BestPoint.errors`). `inflations` (n,) contains
-    for each scattering parameter the ratio of its variance to that under white noise; the weight
-    that draws it to the common value exceeds the one that its spread implies by this factor.
-    """
-
-    found: Together
-    errors: tuple[tuple[CurveError, ...], ...] = ()
-    inflations: Mapping[str, Array] = field(default_factory=dict)
-
-    @cached_property
-    def bests(self) -> tuple[BestPoint, ...]:
-        """The best point of each test."""
-        return tuple(map(BestPoint, self.found.problems, self.found.values))
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of the common unknowns, which precede the own ones.
-
-        They are the shared parameters, the slopes of rate laws (with ":b"), and the logarithms of
-        the common values of scattering parameters.
-        """
-        out, links = list[str](), self.found.links
-        for name in self.found.shared:
-            out += [name, f"{name}:b"] if links.kind(name) in RATES else [name]
-        return (*out, *(name for name in self.found.own if links.kind(name) == "scatter"))
-
-    @cached_property
-    def _own(self) -> list[dict[str, int]]:
-        """Place of each own parameter of each test among the unknowns."""
-        places = count(len(self.names))
-        return [
-            {name: next(places) for name in best.names if name in self.found.own}
-            for best in self.bests
-        ]
-
-    @cached_property
-    def _scales(self) -> Array:
-        """Scales of the unknowns; 1 for a slope or a logarithm."""
-        out, shared = list[float](), set(self.found.shared)
-        for name in self.names:
-            users = [b for b in self.bests if name in shared and name in b.problem.free()]
-            out.append(users[0].size(name) if users else 1.0)
-        for best, own in zip(self.bests, self._own, strict=True):
-            out += map(best.size, own)
-        return np.array(out)
-
-    @cached_property
-    def uncertainty(self) -> Uncertainty:
-        """Uncertainty of all unknowns due to noise."""
-        blocks = tuple(map(self._block, range(len(self.bests))))
-        return Uncertainty(blocks, self._scales, self._drawn())
-
-    def _block(self, t: int) -> Block:
-        """Return the block of a test."""
-        best, links = self.bests[t], self.found.links
-        block = best.block(self.errors[t] if self.errors else ())
-        places = {name: i for i, name in enumerate(self.names)} | self._own[t]
-        through, room = np.zeros((len(best.names), self._scales.size)), np.array(block.room)
-        for i, name in enumerate(best.names):
-            at, kind = places[name], links.kind(name)
-            through[i, at] = 1.0
-            if kind in RATES:
-                v, b = self.found.common[name]
-                f, slope = factor(kind, b, links.x(t))
-                through[i, at : at + 2] = f, v * slope
-            if kind not in ("own", "shared"):
-                room[i] = np.inf
-        return replace(block, through=through * self._scales / best.sizes[:, None], room=room)
-
-    def _drawn(self) -> tuple[Array, Array] | None:
-        """Return the slopes and variances of the residuals that draw values to a common one."""
-        rows, variances = list[Array](), list[float]()
-        for name, pulls in self.found.links.pulls.items():
-            for t, (best, own) in enumerate(zip(self.bests, self._own, strict=True)):
-                if name not in own or name not in self.names:
-                    continue
-                row, value = np.zeros(self._scales.size), best.value(name)
-                row[own[name]] = self._scales[own[name]] / value if value else 0.0
-                row[self.names.index(name)] = -1.0
-                rows.append(row * pulls[t])
-                variances.append(float(self.inflations[name][t]) if self.inflations else 1.0)
-        return (np.array(rows), np.array(variances)) if rows else None
-
-    def of_common(self, name: str) -> Error:
-        """Return the error of a common unknown; NaN for others."""
-        return self._of_sum(np.array([common == name for common in self.names], dtype=float))
-
-    def of_test(self, test: int, name: str) -> Error:
-        """Return the error of a test's parameter; NaN if unreached."""
-        best = self.bests[test]
-        if name not in best.names:
-            return Error(math.nan, 1.0, 1.0)
-        i = best.names.index(name)
-        row = self.uncertainty.blocks[test].through[i] * best.sizes[i] / self._scales
-        return self._of_sum(row)
-
-    def _of_sum(self, row: Array) -> Error:
-        """Return the error of a weighted sum of unknowns."""
-        if not (at := np.flatnonzero(row)).size:
-            return Error(math.nan, 1.0, 1.0)
-        covariance, first = self.uncertainty.covariance, at[0]
-        variance = row[at] @ covariance.matrix[np.ix_(at, at)] @ row[at]
-        freedom, inflation = covariance.freedom[first], covariance.inflation[first]
-        return Error(float(np.sqrt(variance)), float(freedom), float(inflation))
-
-    def reach(self, name: str) -> float:
-        """Return the change of a shared value that raises the cost by 1; 0 if undetermined."""
-        at, uncertainty = self.names.index(name), self.uncertainty
-        change = 0.0 if uncertainty.lost[at] else math.sqrt(uncertainty.inverse[at, at])
-        return change * float(self._scales[at])
-
-    def moved(self, name: str, change: float) -> list[Array]:
-        """Return the values of each test after a change of a shared value.
-
-        The other unknowns follow to minimise the linearised cost.
-        """
-        at, out = self.names.index(name), list[Array]()
-        along = self.uncertainty.inverse[:, at]
-        step = change / self._scales[at] * along / along[at]
-        for block, best in zip(self.uncertainty.blocks, self.bests, strict=True):
-            values = best.values.copy()
-            moved = values[best.places] + block.through @ step * best.sizes
-            values[best.places] = np.clip(moved, *best.box)
-            out.append(values)
-        return out
-
-    def taken(self, test: int) -> Array:
-        """Return the part of a test's noise that the joint fit absorbed; see `noise_processes`.
-
-        A direction that several tests determine absorbed only a share of each test's noise.
-        """
-        left = self.uncertainty.lefts[test]
-        share, axes = np.linalg.eigh(left @ left.T)
-        own = self.uncertainty.blocks[test].axes[0]
-        return np.asarray((own @ axes) * np.sqrt(np.clip(share, 0.0, 1.0)))
-
-    def scale(self, test: int) -> tuple[float, float]:
-        """Return the factor of a test's force that lowers the cost most, and the share it lowers.
-
-        It is a score test: a linear step of this factor and of all unknowns, without a further fit.
-        """
-        best, block, left = self.bests[test], self.uncertainty.blocks[test], self.uncertainty.lefts
-        curve = next((n for n in best.problem.objective.counted if n.startswith("stress")), None)
-        if curve is None:
-            return 1.0, 0.0
-        column = -best.added(curve, best.problem.objective.measured[curve])
-        taken = left[test].T @ (block.axes[0].T @ column)
-        free, slope = float(column @ column - taken @ taken), float(column @ best.residual)
-        if free <= 1e-6 * float(column @ column):
-            return 1.0, 0.0
-        return 1.0 - slope / free, slope**2 / free / max(self.found.cost, 1e-300)
-
-    @cached_property
-    def _undrawn(self) -> tuple[Array, Array]:
-        """Covariance and inverse curvature without the pull to common values, SI, (m, m) each."""
-        full = self.uncertainty
-        held = full.held if full.errs else np.zeros(self._scales.size, dtype=bool)
-        alone = replace(full.bent if full.errs else full, drawn=None)
-        free = np.ix_(~held, ~held)
-        matrix, inverse = np.full((2, held.size, held.size), np.nan)
-        matrix[free], inverse[free] = alone.matrix, alone.inverse
-        scales = np.outer(self._scales, self._scales)
-        return matrix * scales, inverse * scales
-
-    def own_errors(self, test: int, names: Sequence[str]) -> Array:
-        """Return the covariance of own parameters from a test's data alone, SI; else 0."""
-        out, own = np.zeros((len(names), len(names))), self._own[test]
-        rows = [i for i, name in enumerate(names) if name in own]
-        places = [own[names[i]] for i in rows]
-        out[np.ix_(rows, rows)] = np.nan_to_num(self._undrawn[0][np.ix_(places, places)])
-        return out
-
-    def of_logarithms(self, name: str) -> tuple[Array, Array]:
-        """Return covariance and inverse curvature of the logarithms of an own parameter, (n, n).
-
-        Both are from the data alone, without the pull to a common value, over all n tests; NaN
-        where a test does not determine the parameter.
-        """
-        sizes = np.abs(self.found.value(name))
-        tests = [t for t, own in enumerate(self._own) if name in own and sizes[t] > 0.0]
-        places = [self._own[t][name] for t in tests]
-        out = np.full((2, len(self.bests), len(self.bests)), np.nan)
-        for logs, linear in zip(out, self._undrawn, strict=True):
-            inner = linear[np.ix_(places, places)]
-            logs[np.ix_(tests, tests)] = inner / np.outer(sizes[tests], sizes[tests])
-        return out[0], out[1]
 
 
 def cycle_growth(best: BestPoint) -> float | None:
