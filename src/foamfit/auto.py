@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import lmfit
@@ -73,6 +74,7 @@ HISTORY = (
 WITHOUT_GAIN = 2
 # Chains of springs with memory take minutes in an impact. They are skipped if the misfit of one
 # such spring exceeds the misfit of one spring without memory by more than this factor.
+# So is a chain with a linear spring if the one without it exceeds the best model by that factor.
 HOPELESS = 1.1
 # Two of them take a minute even under a prescribed motion. They are skipped if the misfit of one,
 # with or without relaxation, is at most this fraction of the range.
@@ -301,9 +303,14 @@ def _hopeless(model: Model, tried: Sequence[Tried], unpromising: Sequence[Model]
         if Counter(poor.kinds) <= Counter(model.kinds):
             return f"the first descents with {poor.name} were poor"
     slow = [kind for kind in model.kinds if kind in _SLOW]
+    core = [t for t in tried if "+" in t.result.model and f"linear+{t.result.model}" == model.words]
+    best = min(tried, key=attrgetter("misfit"), default=None)
+    if best and any(one.misfit > HOPELESS * best.misfit for one in core):
+        misses = f"{core[0].name} misses the curves by {percent(core[0].misfit)} of the range"
+        return f"{misses}, {best.name} by {percent(best.misfit)}"
     if any(model.options.values()):
         (one, told), (other, against) = least([model.words]), least(_QUICK)
-        return f"{told}, {against}" if one > other else ""
+        return f"{told}, {against}" if HOPELESS * one > other else ""
     if len(model.kinds) == 1 or not slow:
         return ""
     near, told = least(slow)
