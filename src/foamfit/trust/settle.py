@@ -27,7 +27,9 @@ from foamfit.trust.best_point import BestPoint
 # The law errs if its RMS error exceeds the noise, and this share of the scale of the curve, which
 # is at least half a percent of its range.
 OVER_SCALE = 0.2
-MINIMA = 12  # ends of the search from which a descent begins once parameters are held
+# Ends of the search from which a descent begins on all samples or once parameters are held, and
+# their largest cost over the best one.
+MINIMA, NEAR = 12, 1.5
 ITERATIONS = 60  # of such a descent
 LEFT = 1e-6  # predicted gain of the sum of squares at which a refinement ends
 SHOWN = 3.0  # standard errors from the zero of the file, from which the fitted one is another
@@ -69,7 +71,8 @@ def descend_again(problem: Problem, tracker: Tracker) -> None:
     starts = [*([] if best is None else [best]), *tracker.ends]
     tracker.best_values, tracker.best_cost, tracker.ends = None, math.inf, []
     ranked = rank(tracker, space, [space.encode(values) for values in starts])
-    for _, point in distinct(ranked)[:MINIMA]:
+    near = [one for one in ranked if one[0] <= NEAR * ranked[0][0]]
+    for _, point in distinct(near)[:MINIMA]:
         tracker.ends.append(space.decode(descend(tracker, space, point, ITERATIONS)[1]))
     refine(problem, tracker)
 
