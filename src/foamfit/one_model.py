@@ -19,7 +19,8 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.fitting import search
 from foamfit.fitting.curves import check_time_shift, choose_drive
-from foamfit.fitting.minima import exchange_springs, in_order, scan_places, settle_ends
+from foamfit.fitting.hops import has_several
+from foamfit.fitting.minima import in_order, scan_places, settle_ends
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params, make_problem
 from foamfit.fitting.search import STOPPING, SearchRecord, SearchStoppedError, Tracker, what_stopped
 from foamfit.fitting.starts import carried
@@ -216,7 +217,7 @@ def identify(
     """
     began = time.perf_counter()
     problem = options.problem(measurement, model, params)
-    each = STARTS_IN_SERIES if search.has_several(problem.model) else STARTS
+    each = STARTS_IN_SERIES if has_several(problem.model) else STARTS
     starts = each * len(problem.model.kinds) if options.starts is None else options.starts
     deadline = None if options.max_time is None else time.monotonic() + options.max_time
     better = None if options.watch is None else partial(options.watch, problem)
@@ -329,12 +330,7 @@ def _search(
         space = problem.space()
         how: Any = {"rng": rng, "progress": progress, "known": known}
         costs = search.search(coarse, space, starts=record.starts, **how)
-        reached = coarse.best_cost
-        if not known:  # else springs were exchanged before
-            exchange_springs(coarse, space)
         scan_places(coarse, space)
-        if coarse.best_cost < (1.0 - search.NEWS) * reached:
-            search.leave_minimum(coarse, space, new=not known)
         best = [] if coarse.best_values is None else [coarse.best_values]
         return costs, [*best, *coarse.ends]
 

@@ -17,20 +17,22 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import Space
+from foamfit.fitting.hops import has_several
 from foamfit.fitting.levenberg import Iterate, following
 from foamfit.fitting.nuisance import CONTACT_TIME
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.search import Tracker, descend, halve, has_several, rank, squares
+from foamfit.fitting.search import MINIMA, Tracker, descend, halve, rank, squares
 from foamfit.fitting.together import Layout, Together, fit_linked
 from foamfit.springs.laws.record import Law
 from foamfit.springs.model import exchanges
 from foamfit.springs.parameters import relaxation_names, split_name
 
-# Largest number of minima from which springs are exchanged, and of descents from each but the best.
+# Largest number of minima of a joint fit from which springs are exchanged, and of descents from
+# each but the best.
 EXCHANGES, EXCHANGED = 8, 16
 # Ends of the search within NEAR noise variances of the best cost are refined, at most MINIMA of
 # them. Points of the box closer than SAME are one minimum.
-NEAR, MINIMA, SAME = 40.0, 24, 0.02
+NEAR, SAME = 40.0, 0.02
 # Steps of a scan. STEP and SHORTEST: first and shortest step, as a fraction of the box. STEPS: most
 # steps to each side, halved above the noise floor, where nearby minima are equally good.
 STEP, SHORTEST, STEPS = 0.04, 0.015, 12
@@ -96,42 +98,11 @@ def _moved(tracker: Tracker, space: Space, point: Array, column: int, share: flo
     return rank(tracker, space, [np.clip(point + step, low, high) for step in steps])[0][1]
 
 
-def exchange_springs(tracker: Tracker, space: Space) -> None:
-    """Exchange properties between springs of one kind, and descend; the tracker keeps the ends.
-
-    The loop of a chain hardly changes when two springs in series exchange a branch, so each
-    exchange has its own minimum. The exchanges of every minimum that may lead to the best one are
-    tried.
-    """
-    if tracker.best_values is None or not has_several(space.model):
-        return
-    objective, met = tracker.objective, list[Array]()
-    open_ends = [(tracker.best_cost, tracker.best_values)]
-    for _ in range(EXCHANGES):
-        best = tracker.best_cost
-        open_ends = [end for end in open_ends if end[0] <= best + _near(objective)]
-        if not open_ends:
-            break
-        at = min(range(len(open_ends)), key=lambda i: open_ends[i][0])
-        cost, values = open_ends.pop(at)
-        values = in_order(space, objective, values)
-        met.append(space.encode(values))
-        points = [space.encode(other) for other in exchanges(space.model, values)]
-        most = len(points) if cost <= tracker.best_cost else EXCHANGED
-        chosen = [point for _, point in rank(tracker, space, points)[:most]]
-        for cost, end in halve(squares(tracker, space), space.box, chosen):
-            values = in_order(space, objective, space.decode(end))
-            if not _among(met, space.encode(values)):
-                met.append(space.encode(values))
-                tracker.ends.append(values)
-                open_ends.append((cost, values))
-
-
 def joint_minima(found: Together) -> list[Together]:
     """Return the minima of a joint fit that noise could make the best, cheapest first.
 
-    Branches of springs in series are exchanged as in `exchange_springs`, in all tests alike, and
-    the springs put in order, if that changes no curve of any test.
+    Branches of springs in series are exchanged in all tests alike, and the springs put in order, if
+    that changes no curve of any test.
     """
     problems, links, model = found.problems, found.links, found.problems[0].model
     if not has_several(model):

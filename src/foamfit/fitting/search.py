@@ -18,20 +18,10 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
+from foamfit.fitting.hops import ALIKE, Functions, grouped, has_several, hop, under_stress
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.series import ALIKE, Functions, cross, elongations, grouped
-from foamfit.fitting.starts import (
-    CURVE_STARTS,
-    Reading,
-    apart,
-    around,
-    box_starts,
-    far_off,
-    neighbours,
-    off_edges,
-    thinned,
-)
-from foamfit.springs.model import Model
+from foamfit.fitting.starts import BOX_STARTS, Reading, box_starts, thinned
+from foamfit.springs.model import exchanges
 from foamfit.springs.parameters import NUISANCE
 
 Progress = Callable[[float, str], None]
@@ -39,24 +29,20 @@ Progress = Callable[[float, str], None]
 PULSE = 16  # evaluations between two calls of `Tracker.pulse`
 # Fractions of the run time of a search at which its parts begin, as measured.
 DESCENTS, ON_CURVES, REFINED = 0.25, 0.75, 0.95
-# Largest number of rounds: a second one if only one descent led to the best end, and a third if its
-# cost is still above the noise floor.
+# Largest number of rounds; see `_settled`.
 ATTEMPTS = 3
 FOUND_AGAIN = 0.02  # relative difference of the costs of descents that agree on the best end
-LOST = 30.0  # cost, in noise floors, above which a second round always follows
 NOISY = 0.005  # noise of a motion, as a fraction of its range, above which it is smoothed
-# Points beside the best one are tried if the cost exceeds this fraction of the noise floor.
-MISSING = 0.8
-# They are tried again if the cost has fallen by more than this fraction.
-NEWS = 1e-5
-# Minima of the loop are continued if their cost on the curves is within this factor of the best.
-PROMISING = 100.0
+MISSING = 0.8  # fraction of the noise floor up to which a cost is mere noise
+NEWS = 1e-5  # relative fall of the cost by which a hop has found another minimum
+# Hops in a row on the curves that find nothing better, which ends them: of one spring, and where
+# there are many minima. MINIMA: the largest number of minima that is kept.
+SHORT, LONG, MINIMA = 40, 160, 24
 # Stages of successive halving: iterations, the share of the starts that then goes on, and that of
 # the work.
 STAGES = ((8, 0.5, 0.5), (8, 0.25, 0.25), (24, 0.25, 0.25))
 HALFWAY = STAGES[0][2]
 LEAST = 6  # descents that go on in any case
-FEWER = 4  # divisor of the number of starts if a poorer model has found good ones
 
 
 class SearchStoppedError(Exception):
@@ -250,32 +236,24 @@ def search(
 
     `starts` descents begin on the smooth loop, and the best of their ends go on along the curves of
     the drive; `ATTEMPTS` says when this is repeated. Returns the final costs, best first, each with
-    the number of descents on the loop that led to it. With points already `known`, which a poorer
-    model has found, there are fewer starts and one round. Raises SearchStoppedError after the time
-    limit.
+    the number of descents on the loop that led to it. Points already `known`, which a poorer model
+    has found, replace all other starts. Raises SearchStoppedError after the time limit.
     """
     progress(0.0, "start values")
-    points = [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]
-    given = [space.encode(values) for values in known]
-    if known:
-        points, starts = points + given, max(starts // FEWER, LEAST)
-    out: list[tuple[float, int]] = []
-    attempts, edges, left = 1 if known else ATTEMPTS, list[float](), np.inf
+    out = list[tuple[float, int]]()
+    points = [space.encode(values) for values in known]
+    points += [] if known else [space.encode(space.values), *box_starts(space, rng, BOX_STARTS)]
+    attempts, most = (1, LEAST) if known else (ATTEMPTS, max(3, starts // 4))
     for attempt in range(attempts):
-        before = tracker.best_cost
-        counts: dict[int, int] = {}
-        if tracker.objective.measurement.displacement is not None:
+        before, counts = tracker.best_cost, dict[int, int]()
+        if tracker.objective.measurement.displacement is not None and not known:
             found = distinct(_search_loop(tracker, space, points, starts, rng, progress))
             points = [point for _, point in found]
             counts = {id(point): count for count, point in found}
         ranked = rank(tracker, space, points)
-        if attempt == 0 and tracker.objective.drive != "impact":  # else the loop has other curves
-            tracker.look()
-        promising = [item for item in ranked if item[0] <= PROMISING * ranked[0][0]]
-        points = [point for _, point in distinct(promising)][: max(3, starts // 4)]
-        points += [point for _, point in distinct(rank(tracker, space, given))[:LEAST]]
-        if attempt > 0:
-            points += [p for _, p in rank(tracker, space, around(space, ranked[0][1], rng))[:3]]
+        if counts and attempt == 0 and tracker.objective.drive != "impact":
+            tracker.look()  # the loop of an impact has other curves
+        points = [point for _, point in distinct(ranked)][:most]
         for i, point in enumerate(points):
             progress(ON_CURVES + (REFINED - ON_CURVES) * i / len(points), "curves")
             cost, end = descend(tracker, space, point, 60)
@@ -283,94 +261,57 @@ def search(
             out.append((cost, counts.get(id(point), 1)))
         if attempt == 0:
             tracker.look()
-        if tracker.best_cost < (1.0 - NEWS) * left:  # otherwise these points were tried before
-            edges, more = leave_minimum(tracker, space, new=not known)
-            out += more
-            left = tracker.best_cost
-        if attempt + 1 == attempts or _settled(tracker, out, attempt, 2 if edges else 1, before):
+        now = min(cost for cost, _ in out[-len(points) :])
+        if attempt + 1 == attempts or _settled(tracker, out, attempt, before, now):
             break
-        points = box_starts(space, rng, CURVE_STARTS // 3)
-        if tracker.best_values is not None:
-            points += around(space, space.encode(tracker.best_values), rng)
+        points = box_starts(space, rng, BOX_STARTS)
+    reached = tracker.best_cost
+    several = has_several(space.model)
+    # Stress waves, which no law follows, give impacts many wrong minima.
+    errs = tracker.objective.measurement.striker is not None and reached > tracker.objective.floor
+    if not (several and known):  # springs of the poorer model were combined
+        leave_minimum(tracker, space, rng, LONG if several or errs else SHORT)
+    if tracker.best_cost < (1.0 - NEWS) * reached:
+        out.append((tracker.best_cost, 1))
     return sorted(out)
 
 
-def leave_minimum(
-    tracker: Tracker, space: Space, *, new: bool = True
-) -> tuple[list[float], list[tuple[float, int]]]:
-    """Descend from points beside the best one; return costs off the edges of the box, and all.
+def leave_minimum(tracker: Tracker, space: Space, rng: np.random.Generator, patience: int) -> None:
+    """Hop from the ends on the curves until `patience` in a row find nothing better.
 
-    The costs are those of `search`. A minimum that is not `new`, but that of a poorer model, was
-    left before.
+    The tracker keeps the minima.
+
+    The loop of a chain hardly changes when two springs in series exchange a branch, so each
+    exchange has its own minimum.
     """
     if tracker.best_values is None:
-        return [], []
-    edges, floor = list[float](), tracker.objective.floor
-    anywhere = new and len(space.model.kinds) > 1
-    for _ in range(ATTEMPTS):
-        before, best = tracker.best_cost, space.encode(tracker.best_values)
-        starts = off_edges(space, best, anywhere=anywhere and before > floor)
-        if before > floor:
-            starts += neighbours(space, space.decode(best))
-        edges += _descended(tracker, space, starts)
-        if tracker.best_cost >= (1.0 - NEWS) * before:
-            break
-    out = [(cost, 1) for cost in edges]
-    if new and tracker.best_cost >= MISSING * floor:
-        starts = apart(space, space.encode(tracker.best_values))
-        out += [(cost, 1) for cost in _descended(tracker, space, starts)]
-    if (reached := tracker.best_cost) >= MISSING * floor:
-        _descended(tracker, space, far_off(space, space.encode(tracker.best_values)))
-    if tracker.best_cost < reached:  # counts once, as these descents are not independent
-        out.append((tracker.best_cost, 1))
-    return edges, out
-
-
-def has_several(model: Model) -> bool:
-    """Return whether a model has more than one hysteretic spring."""
-    return sum(law.hysteretic for law in model.laws) > 1
-
-
-def _descended(tracker: Tracker, space: Space, starts: list[Array]) -> list[float]:
-    """Descend from each start; return the costs of the ends, which the tracker keeps.
-
-    Far from a minimum a descent may begin badly and end well, so only the many starts of several
-    springs are halved: on a slow mycelium test, halving misses the best minimum of one spring.
-    """
-    if has_several(space.model):
-        ends = halve(squares(tracker, space), space.box, starts)
-    else:
-        ends = [descend(tracker, space, start, 60) for start in starts]
-    tracker.ends += [space.decode(end) for _, end in ends]
-    return [cost for cost, _ in ends]
+        return
+    functions = squares(tracker, space)
+    ends = rank(tracker, space, [space.encode(values) for values in tracker.ends])
+    chains = exchanges(space.model, tracker.best_values) if has_several(space.model) else ()
+    ends += halve(functions, space.box, [space.encode(values) for values in chains])
+    groups = grouped(hop(space, ends, functions, rng, patience=patience), ALIKE)
+    tracker.ends = [space.decode(group[0][1]) for group in groups[:MINIMA]]
 
 
 def _settled(
-    tracker: Tracker, ends: list[tuple[float, int]], attempt: int, least: int, before: float
+    tracker: Tracker, ends: list[tuple[float, int]], attempt: int, before: float, now: float
 ) -> bool:
-    """Return whether no further round is needed; `before` is the best cost of earlier ones.
+    """Return whether no further round is needed after the best costs `before` and `now`.
 
     Several descents must agree on the best end, or after a second round its cost must be at the
-    noise floor. `least` rounds are made if the best end is above the noise floor, and two if it is
-    far above. The ends of springs in series that were combined are no independent ones: there a
-    round with new starts must have found nothing better, unless several agree on mere noise.
+    noise floor. The ends of springs in series are not independent, as they were combined: there two
+    rounds must agree, unless several ends agree on mere noise.
     """
-    best, floor = min(ends)[0], tracker.objective.floor
+    best, floor, agree = min(ends)[0], tracker.objective.floor, _agreeing(ends) > 1
     if has_several(tracker.objective.model):
-        sure = best <= MISSING * floor and _agreeing(ends) > 1
-        return sure or best > (1.0 - FOUND_AGAIN) * before
-    if attempt + 1 < least and best > floor:
-        return False
-    if attempt == 0 and best > LOST * floor:
-        return False
-    if _agreeing(ends) > 1:
-        return True
-    return attempt > 0 and best <= floor
+        return (agree and best <= MISSING * floor) or abs(now - before) <= FOUND_AGAIN * best
+    return agree or (attempt > 0 and best <= floor)
 
 
 def ensure_feasible(tracker: Tracker, space: Space, rng: np.random.Generator) -> None:
     """Find a point that can be simulated, if the search was stopped before it had one."""
-    for point in [space.encode(space.values), *box_starts(space, rng, CURVE_STARTS // 3)]:
+    for point in [space.encode(space.values), *box_starts(space, rng, BOX_STARTS)]:
         if tracker.best_values is not None:
             return
         tracker.consider(space.decode(point))
@@ -407,16 +348,9 @@ def _search_loop(
                 tracker.consider(inner.best_values)
                 tracker.look()
 
-        points = spread_out(own, points, starts)
-        if series := has_several(own.model) and not own.model.relaxation:
-            stretched = elongations(along, own)
-            points = [
-                levenberg.descend(*stretched, p, own.box, 30, enough=1e-3).point for p in points
-            ]
-        ends = halve(squares(inner, own), own.box, points, step)
-        if series:
-            ends += rank(inner, own, [own.encode(values) for values in tracker.ends])
-            ends = cross(own, ends, squares(inner, own), stretched, rng)
+        ends = halve(squares(inner, own), own.box, spread_out(own, points, starts), step)
+        if has_several(own.model) and not own.model.relaxation:
+            ends = hop(own, ends, squares(inner, own), rng, under_stress(along, own))
         ends = [(cost, space.encode(own.decode(end))) for cost, end in ends]
     finally:
         if inner.best_values is not None:

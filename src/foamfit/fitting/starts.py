@@ -1,11 +1,8 @@
-"""Start values: springs read off the measured loop, and points all over the box.
-
-Other points lie beside the best one found: the search may have ended in a wrong minimum.
-"""
+"""Start values: springs read off the measured loop, and points all over the box."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -21,24 +18,17 @@ from foamfit.fitting.box import Space
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.springs.laws.record import Law, Param
 from foamfit.springs.loop import Loop
-from foamfit.springs.parameters import family, relaxation_names, split_name
+from foamfit.springs.parameters import family, split_name
 
 LOOP_SAMPLES = 300
-CURVE_STARTS = 300
+CURVE_STARTS, BOX_STARTS = 300, 100
+IN_SERIES = -1  # way to read a loop whose kinks are those of springs in series
 OWN_MARKS = 5  # random numbers per spring; further ones that a law needs are appended
 # Range of random start values of nuisance parameters, and of the time shift.
 NEAR_USUAL, LATE = (-0.05, 0.05), (-0.3, 0.3)
-AROUND = 200  # random points around the best one
-# Width of the edge of the box, and a wider one, as fractions of the box; start points inside the
-# box for a coordinate at its edge.
-EDGE, EDGE_MISSING, INSIDE = 0.02, 0.1, (0.35, 0.5, 0.65)
-# Changes of the logarithm of a parameter, and of a relaxation time, to leave a wrong minimum.
-APART, APART_IN_TIME = (1.2, -1.2), (3.0, -3.0, 4.8, -4.8)
 # Strength of relaxation terms that are new to a fitted model, and their times, as shares of the
 # time under load.
 WEAK, CARRIED_TIMES = 0.05, (0.01, 0.1, 0.5)
-# Strength of each new relaxation term, and the scales of parameters adjusted to it.
-ANEW, STIFF = 0.3, ("stress", "slope")
 
 
 def thinned(
@@ -47,9 +37,9 @@ def thinned(
     """Return a test with a few hundred of its samples, on which starts are ranked and descend.
 
     The peaks of stress and motion and the turning points are among them. Each sample is still the
-    mean over as many rows of the file. `followed` is the motion
-    without its noise, m, if it is known; otherwise the motion of a `loop` is smoothed. A `loop` is
-    compared along the motion alone and begins at the contact.
+    mean over as many rows of the file. `followed` is the motion without its noise, m, if it is
+    known; otherwise the motion of a `loop` is smoothed. A `loop` is compared along the motion alone
+    and begins at the contact.
     """
     motion, stress, time = measurement.displacement, measurement.stress, measurement.time
     assert stress is not None
@@ -117,8 +107,8 @@ class Reading:
         more = sum(max(law.wanted_marks - OWN_MARKS, 0) for law in laws if law.hysteretic)
         return 7 * len(laws) + more + relaxing
 
-    def start(self, mark: Array, way: int, *, in_series: bool) -> Array:
-        """Return the start point at some places."""
+    def start(self, mark: Array, way: int) -> Array:
+        """Return the start point at some places, read in one of the ways of a law."""
         space, model, laws = self.space, self.space.model, self.space.model.laws
         values, lines = space.values.copy(), [law.own == ("k0",) for law in laws]
         heights = np.full(len(laws), space.scales.height / len(laws))
@@ -146,11 +136,11 @@ class Reading:
             own = model.own(i, values)
             if law.read_off is None:
                 own[:] = _anywhere(space, law, places)
-            elif law.read_in_series is not None and soft > heights[i] and in_series:
+            elif law.read_in_series is not None and soft > heights[i] and way == IN_SERIES:
                 places = np.append(places, mark[7 * i + 6])
                 own[:] = law.read_in_series(left, places, heights[i] / soft)
             else:
-                own[:] = law.read_off(left, places, space.scales, way)
+                own[:] = law.read_off(left, places, space.scales, max(way, 0))
             terms = model.own_places[i] + own.size
             for at in range(terms, terms + 2 * model.relaxation * law.hysteretic, 2):
                 values[at] = 10.0 ** (1.5 * next(rest) - 1.5)
@@ -158,13 +148,13 @@ class Reading:
         return space.encode(values)
 
     def starts(self, rng: np.random.Generator) -> list[Array]:
-        """Return starts at places from a Latin hypercube, every other one with kinks in series."""
+        """Return starts at places from a Latin hypercube, read in each possible way in turn."""
+        laws = self.space.model.laws
+        ways = [*range(max(law.ways for law in laws))]
+        if len(laws) > 1 and any(law.read_in_series for law in laws):
+            ways.append(IN_SERIES)
         marks = qmc.LatinHypercube(self.size, rng=rng).random(CURVE_STARTS)
-        ways = range(max(law.ways for law in self.space.model.laws))
-        return [
-            self.start(mark, way, in_series=turn % 2 == 1)
-            for (turn, mark), way in product(enumerate(marks), ways)
-        ]
+        return [self.start(mark, ways[i % len(ways)]) for i, mark in enumerate(marks)]
 
 
 def _anywhere(space: Space, law: Law, marks: Array) -> Array:
@@ -245,100 +235,3 @@ def _heights(space: Space, values: Array) -> list[float]:
     given = dict(zip(space.names, values.tolist(), strict=True))
     names = [f"s{i}_height" for i in range(1, len(space.model.kinds) + 1)]
     return [given.get(name, space.scales.height) for name in names]
-
-
-# ---------------------------------------------------------------- beside the best point
-
-
-def around(space: Space, best: Array, rng: np.random.Generator) -> list[Array]:
-    """Return random points around the best one, with about half of the coordinates changed."""
-    (low, high), out = space.box, []
-    for _ in range(AROUND):
-        far = 10.0 ** rng.uniform(-2.0, -0.5) * rng.standard_normal(best.size)
-        moved = best + np.where(rng.random(best.size) < 0.5, far, 0.0) * (high - low)
-        out.append(np.clip(moved, low, high))
-    return out
-
-
-def _moved(space: Space, best: Array, at: int, places: Iterable[float]) -> Iterator[Array]:
-    """Yield the best point with one coordinate at other places inside the box."""
-    for place in places:
-        if space.box[0][at] < place < space.box[1][at]:
-            start = best.copy()
-            start[at] = place
-            yield start
-
-
-def _inside(space: Space, best: Array, at: int, edges: tuple[float, float]) -> Iterator[Array]:
-    """Yield the best point with a coordinate moved inside, if it is so far from an edge."""
-    low, high = (end[at] for end in space.box)
-    if edges[0] <= min(best[at] - low, high - best[at]) / (high - low) < edges[1]:
-        yield from _moved(space, best, at, [low + share * (high - low) for share in INSIDE])
-
-
-def off_edges(space: Space, best: Array, *, anywhere: bool) -> list[Array]:
-    """Return points with positive parameters at an edge of the box, or `anywhere`, moved inside.
-
-    A stiffness that affects few samples may run to an edge and stay there while the rest converges.
-    In a chain above the noise floor any stiffness may be far off.
-    """
-    edges = (-1.0, 1.0 if anywhere else EDGE)
-    logs = [at for at, one in enumerate(space.coordinates) if one.is_logarithmic]
-    return [start for at in logs for start in _inside(space, best, at, edges)]
-
-
-def apart(space: Space, best: Array) -> list[Array]:
-    """Return the best point with one positive parameter multiplied or divided by a factor.
-
-    All descents may have ended in the same wrong minimum.
-    """
-    logs = [at for at, one in enumerate(space.coordinates) if one.is_logarithmic]
-    return [x for at in logs for x in _moved(space, best, at, [best[at] + by for by in APART])]
-
-
-def far_off(space: Space, best: Array) -> list[Array]:
-    """Return points farther from the best one than those of `off_edges` and `apart`.
-
-    They have other relaxation times (far off, the cost is flat along them), new relaxation terms,
-    or coordinates in the outer tenth of the box moved inside.
-    """
-    out = list[Array]()
-    for at, one in enumerate(space.coordinates):
-        if family(one.short) == "tau":
-            out += _moved(space, best, at, [best[at] + by for by in APART_IN_TIME])
-        if one.is_logarithmic:
-            out += _inside(space, best, at, (EDGE, EDGE_MISSING))
-    return [*out, *_relaxing_anew(space, space.decode(best))]
-
-
-def _relaxing_anew(space: Space, values: Array) -> Iterator[Array]:
-    """Yield a point with new relaxation terms, of 1/100 to 1/10 of the time under load.
-
-    The springs keep their instantaneous stiffness k (1 + Σ g). Large strengths with long times form
-    a wide wrong minimum.
-    """
-    model, moved, count = space.model, values.copy(), space.model.relaxation
-    times = space.scales.duration * 10.0 ** ((np.arange(count) + 0.5) / max(count, 1) - 2.0)
-    for spring, law in enumerate(model.laws if count else ()):
-        names = [f"s{spring + 1}_{short}" for short in relaxation_names(count)]
-        stiff = [f"s{spring + 1}_{one.name}" for one in law.params if one.scale in STIFF]
-        if not law.hysteretic or not set(space.free).issuperset(names + stiff):
-            continue
-        places = [model.index[name] for name in names]
-        before = 1.0 + float(values[places[::2]].sum())
-        moved[places] = np.ravel(np.column_stack([np.full(count, ANEW), times]))
-        moved[[model.index[name] for name in stiff]] *= before / (1.0 + ANEW * count)
-    if np.any(moved != values):
-        yield space.encode(moved)
-
-
-def neighbours(space: Space, values: Array) -> Iterator[Array]:
-    """Yield points with nearly the same loop, from `Law.neighbours` of each spring."""
-    for spring, law in enumerate(space.model.laws):
-        own = space.model.own(spring, values)[:-1]
-        for near in law.neighbours(own, space.scales.stress):
-            changed = [f"s{spring + 1}_{law.own[at]}" for at in np.flatnonzero(near != own)]
-            if all(name in space.free for name in changed):
-                moved = values.copy()
-                space.model.own(spring, moved)[:-1] = near
-                yield space.encode(moved)

@@ -1,0 +1,166 @@
+"""Hops of the search: descents from points beside its good ends, which may be in a wrong minimum.
+
+Springs in series share the strain, so that a change of one moves the branches of all others, and
+few descents from start values end in the best minimum. There the hops also combine ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from operator import itemgetter
+
+import numpy as np
+
+from foamfit.arrays import Array
+from foamfit.fitting.box import Space
+from foamfit.fitting.levenberg import Iterate, descend
+from foamfit.fitting.objective import Objective
+from foamfit.springs.model import Model, exchanges
+
+# Residual at a point of the box, and its derivative by the coordinates.
+Functions = tuple[Callable[[Array], Array], Callable[[Array], Array]]
+End = tuple[float, Array]  # cost and coordinates of the end of a descent
+Way = Callable[[Space, Array, Array, np.random.Generator], Array]  # from two points to a child
+
+ALIKE = 1e-3  # relative difference of the costs of descents that ended in one minimum
+# Samples to each side from which the local slope of a loop is taken, and its limits over the mean.
+NEARBY, LEAST_SLOPE, LARGEST_SLOPE = 3, 0.02, 20.0
+# Ends that are combined, and the least relative difference of their costs; failures in a row after
+# which this stops.
+POOL, DIFFERENT, PATIENCE = 12, 0.01, 120
+# Stages of the descent from a child: iterations, relative gain at which it ends, and largest cost,
+# over the best one, with which it goes on.
+STAGES = ((5, ALIKE, 5.0), (7, ALIKE, 1.5), (40, 1e-5, np.inf))
+
+
+def grouped(ends: Sequence[End], alike: float) -> list[list[End]]:
+    """Return the ends of descents, best first, in groups whose relative cost differs by `alike`."""
+    groups: list[list[End]] = []
+    for end in sorted(ends, key=itemgetter(0)):
+        if groups and end[0] <= (1.0 + alike) * groups[-1][0][0]:
+            groups[-1].append(end)
+        else:
+            groups.append([end])
+    return groups
+
+
+def under_stress(along: Objective, space: Space) -> Way:
+    """Return a way to a child that descends along the motion under the measured stress of a loop.
+
+    Under one stress the elongations of springs in series add up: each bends the curve at stresses
+    of its own. A descent there has other wrong minima than one along the motion, whose objective is
+    `along`. Each elongation that is missed is multiplied by the local slope of the loop, so that it
+    counts as the stress that is missed.
+    """
+    test = along.measurement
+    assert test.displacement is not None
+    assert test.stress is not None
+    motion, stress = test.displacement, test.stress
+    span, at = float(np.ptp(motion)), np.arange(motion.size)
+    under = Objective(
+        replace(test, noise=replace(test.noise, displacement=span)), along.model, "stress",
+        {"displacement_time": 1.0}, nuisance=(), spent=along.spent,
+    )  # fmt: skip
+    ahead, behind = np.minimum(at + NEARBY, at[-1]), np.maximum(at - NEARBY, 0)
+    run = np.maximum(np.abs(motion[ahead] - motion[behind]), 1e-9 * span) / span
+    slope = np.abs(stress[ahead] - stress[behind]) / run / np.ptp(stress)
+    weight = np.clip(slope, LEAST_SLOPE, LARGEST_SLOPE) * along.span("stress_strain")
+    weight, count = weight[under.kept["displacement_time"]], len(along.model.names)
+
+    def residual(point: Array) -> Array:
+        return np.asarray(weight * under.residual(space.decode(point)[:count]))
+
+    def jacobian(point: Array) -> Array:
+        values = space.decode(point)
+        moves = space.slopes(point, values)[:count]
+        return np.asarray(weight[:, None] * under.jacobian_along(values[:count], moves))
+
+    def stretched(_: Space, one: Array, *_others: object) -> Array:
+        return descend(residual, jacobian, one, space.box, 15, enough=ALIKE).point
+
+    return stretched
+
+
+def has_several(model: Model) -> bool:
+    """Return whether a model has more than one hysteretic spring."""
+    return sum(law.hysteretic for law in model.laws) > 1
+
+
+def hop(
+    space: Space, ends: Sequence[End], functions: Functions, rng: np.random.Generator,
+    *more: Way, patience: int = PATIENCE,
+) -> list[End]:  # fmt: skip
+    """Descend from children of the best ends until `patience` in a row are no better.
+
+    `functions` are the residual and its derivative; `WAYS`, for springs in series `IN_SERIES`
+    too, and `more` of them say how a child is made of two ends. Return all ends.
+    """
+    ways = *WAYS, *(IN_SERIES if has_several(space.model) else ()), *more
+    pool, failed, out = [group[0] for group in grouped(ends, DIFFERENT)][:POOL], 0, [*ends]
+    while failed < patience:
+        best = pool[0][0]
+        one, other = (pool[int(len(pool) * rng.random() ** 2)][1] for _ in range(2))
+        child = ways[rng.integers(len(ways))](space, one, other, rng)
+        at: Array | Iterate = child
+        for iterations, enough, hopeful in STAGES:
+            at = end = descend(*functions, at, space.box, iterations, enough=enough)
+            if end.cost > hopeful * best:
+                break
+        out.append((end.cost, end.point))
+        failed = 0 if end.cost < (1.0 - ALIKE) * best else failed + 1
+        pool = [group[0] for group in grouped([*pool, out[-1]], DIFFERENT)][:POOL]
+    return out
+
+
+def _crossed(space: Space, one: Array, other: Array, rng: np.random.Generator) -> Array:
+    """Return a point with a spring of another point, every second time with its height.
+
+    Springs of one law are taken for each other. The last height follows from the others.
+    """
+    model, out, source = space.model, space.decode(one), space.decode(other)
+    to = int(rng.integers(len(model.kinds)))
+    place = int(rng.choice([i for i, law in enumerate(model.laws) if law is model.laws[to]]))
+    model.own(to, out)[:] = model.own(place, source)
+    if rng.random() < 0.5:
+        out[model.index[f"s{to + 1}_height"]] = source[model.index[f"s{place + 1}_height"]]
+    return space.encode(space.complete(out))
+
+
+def _exchanged(space: Space, one: Array, _: Array, rng: np.random.Generator) -> Array:
+    """Return a point whose springs have exchanged branches."""
+    chains = [*exchanges(space.model, space.decode(one))]
+    return space.encode(chains[rng.integers(len(chains))]) if chains else one
+
+
+def _mixed(space: Space, one: Array, other: Array, rng: np.random.Generator) -> Array:
+    """Return a point with about half of the coordinates of another."""
+    return np.where(rng.random(one.size) < 0.5, one, other)
+
+
+def _far(space: Space, one: Array, _: Array, rng: np.random.Generator) -> Array:
+    """Return a point with one coordinate anywhere in the box."""
+    out, at, (low, high) = one.copy(), rng.integers(one.size), space.box
+    out[at] = rng.uniform(low[at], high[at])
+    return out
+
+
+def _beside(space: Space, one: Array, _: Array, rng: np.random.Generator) -> Array:
+    """Return a point with about half of the coordinates changed."""
+    far = 10.0 ** rng.uniform(-2.0, -0.5) * rng.standard_normal(one.size)
+    low, high = space.box
+    return np.clip(one + np.where(rng.random(one.size) < 0.5, far, 0.0) * (high - low), low, high)
+
+
+def _nearly(space: Space, one: Array, _: Array, rng: np.random.Generator) -> Array:
+    """Return a point with nearly the same loop, from `Law.neighbours` of a spring."""
+    model, values = space.model, space.decode(one)
+    spring = int(rng.integers(len(model.laws)))
+    law, own = model.laws[spring], model.own(spring, values)[:-1]
+    if near := [*law.neighbours(own.copy(), space.scales.stress)]:
+        own[:] = near[rng.integers(len(near))]
+    return space.encode(space.complete(values))
+
+
+WAYS: tuple[Way, ...] = _mixed, _far, _beside, _nearly
+IN_SERIES: tuple[Way, ...] = _crossed, _exchanged
