@@ -6,7 +6,7 @@ few descents from start values end in the best minimum. There the hops also comb
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from operator import itemgetter
 
@@ -152,15 +152,17 @@ def _beside(space: Space, one: Array, _: Array, rng: np.random.Generator) -> Arr
     return np.clip(one + np.where(rng.random(one.size) < 0.5, far, 0.0) * (high - low), low, high)
 
 
-def _nearly(space: Space, one: Array, _: Array, rng: np.random.Generator) -> Array:
-    """Return a point with nearly the same loop, from `Law.neighbours` of a spring."""
-    model, values = space.model, space.decode(one)
-    spring = int(rng.integers(len(model.laws)))
-    law, own = model.laws[spring], model.own(spring, values)[:-1]
-    if near := [*law.neighbours(own.copy(), space.scales.stress)]:
-        own[:] = near[rng.integers(len(near))]
-    return space.encode(space.complete(values))
+def neighbours(model: Model, values: Array, top: float) -> Iterator[Array]:
+    """Yield parameters with nearly the same loop, from `Law.neighbours` of each spring.
+
+    `top` is the largest stress, Pa.
+    """
+    for spring, law in enumerate(model.laws):
+        for near in law.neighbours(model.own(spring, values)[:-1], top):
+            moved = values.copy()
+            model.own(spring, moved)[:-1] = near
+            yield moved
 
 
-WAYS: tuple[Way, ...] = _mixed, _far, _beside, _nearly
+WAYS: tuple[Way, ...] = _mixed, _far, _beside
 IN_SERIES: tuple[Way, ...] = _crossed, _exchanged

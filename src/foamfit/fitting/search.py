@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from operator import attrgetter, itemgetter
 
 import numpy as np
@@ -18,7 +19,15 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
-from foamfit.fitting.hops import ALIKE, Functions, grouped, has_several, hop, under_stress
+from foamfit.fitting.hops import (
+    ALIKE,
+    Functions,
+    grouped,
+    has_several,
+    hop,
+    neighbours,
+    under_stress,
+)
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.starts import BOX_STARTS, Reading, box_starts, thinned
 from foamfit.springs.model import exchanges
@@ -282,13 +291,14 @@ def leave_minimum(tracker: Tracker, space: Space, rng: np.random.Generator, pati
     The tracker keeps the minima.
 
     The loop of a chain hardly changes when two springs in series exchange a branch, so each
-    exchange has its own minimum.
+    exchange has its own minimum; so have the neighbours of a single spring.
     """
     if tracker.best_values is None:
         return
     functions = squares(tracker, space)
     ends = rank(tracker, space, [space.encode(values) for values in tracker.ends])
-    chains = exchanges(space.model, tracker.best_values) if has_several(space.model) else ()
+    alike = exchanges if has_several(space.model) else partial(neighbours, top=space.scales.stress)
+    chains = alike(space.model, tracker.best_values)
     ends += halve(functions, space.box, [space.encode(values) for values in chains])
     groups = grouped(hop(space, ends, functions, rng, patience=patience), ALIKE)
     tracker.ends = [space.decode(group[0][1]) for group in groups[:MINIMA]]
