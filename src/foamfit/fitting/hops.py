@@ -102,6 +102,9 @@ def hop(
         best = pool[0][0]
         one, other = (pool[int(len(pool) * rng.random() ** 2)][1] for _ in range(2))
         child = ways[rng.integers(len(ways))](space, one, other, rng)
+        if np.array_equal(child, one):
+            failed += 1
+            continue
         at: Array | Iterate = child
         for iterations, enough, hopeful in STAGES:
             at = end = descend(*functions, at, space.box, iterations, enough=enough)

@@ -274,34 +274,34 @@ def search(
         if attempt + 1 == attempts or _settled(tracker, out, attempt, before, now):
             break
         points = box_starts(space, rng, BOX_STARTS)
-    reached = tracker.best_cost
-    several = has_several(space.model)
+    several, floor = has_several(space.model), tracker.objective.floor
     # Stress waves, which no law follows, give impacts many wrong minima.
-    errs = tracker.objective.measurement.striker is not None and reached > tracker.objective.floor
+    errs = tracker.objective.measurement.striker is not None and tracker.best_cost > floor
     if not (several and known):  # springs of the poorer model were combined
-        leave_minimum(tracker, space, rng, LONG if several or errs else SHORT)
-    if tracker.best_cost < (1.0 - NEWS) * reached:
-        out.append((tracker.best_cost, 1))
+        out += leave_minimum(tracker, space, rng, LONG if several or errs else SHORT)
     return sorted(out)
 
 
-def leave_minimum(tracker: Tracker, space: Space, rng: np.random.Generator, patience: int) -> None:
+def leave_minimum(
+    tracker: Tracker, space: Space, rng: np.random.Generator, patience: int
+) -> list[tuple[float, int]]:
     """Hop from the ends on the curves until `patience` in a row find nothing better.
 
-    The tracker keeps the minima.
+    The tracker keeps the minima. The costs of the hops are returned as by `search`.
 
     The loop of a chain hardly changes when two springs in series exchange a branch, so each
     exchange has its own minimum; so have the neighbours of a single spring.
     """
     if tracker.best_values is None:
-        return
+        return []
     functions = squares(tracker, space)
     ends = rank(tracker, space, [space.encode(values) for values in tracker.ends])
     alike = exchanges if has_several(space.model) else partial(neighbours, top=space.scales.stress)
     chains = alike(space.model, tracker.best_values)
     ends += halve(functions, space.box, [space.encode(values) for values in chains])
-    groups = grouped(hop(space, ends, functions, rng, patience=patience), ALIKE)
-    tracker.ends = [space.decode(group[0][1]) for group in groups[:MINIMA]]
+    every = hop(space, ends, functions, rng, patience=patience)
+    tracker.ends = [space.decode(group[0][1]) for group in grouped(every, ALIKE)[:MINIMA]]
+    return [(cost, 1) for cost, _ in every[len(ends) :]]
 
 
 def _settled(

@@ -23,10 +23,10 @@ from foamfit.arrays import Array, Mask
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import Space
 from foamfit.fitting.branches import unreached
+from foamfit.fitting.hops import has_several
 from foamfit.fitting.links import Links
 from foamfit.fitting.minima import in_order, joint_minima
 from foamfit.fitting.problem import Problem
-from foamfit.fitting.search import has_several
 from foamfit.fitting.together import Layout, Together, fit_linked
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study import gain

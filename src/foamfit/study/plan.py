@@ -22,10 +22,10 @@ from foamfit.data.measurement import MEASURED, Measurement, Noise, Specimen, Str
 from foamfit.data.rig import Candidate, Rig, beyond, candidates, read_rig
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.branches import unreached
+from foamfit.fitting.hops import has_several
 from foamfit.fitting.minimizer import problem_of
 from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import make_params, make_problem
-from foamfit.fitting.search import has_several
 from foamfit.one_model import Progress
 from foamfit.parts import rung_name
 from foamfit.report.studies.plan import RISKY, Expected, Outcome, Plan, Quantity
