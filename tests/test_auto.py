@@ -184,7 +184,7 @@ def test_a_clear_structure_is_found(name):
 def test_two_bistable_springs_are_told_from_fewer(monkeypatch):
     """To save time, omit the model of a linear spring and hops from the best minimum."""
     monkeypatch.setattr(auto, "LADDER", groups("bistable", "bistable+bistable"))
-    monkeypatch.setattr(search, "leave_minimum", lambda *_: None)
+    monkeypatch.setattr(search, "leave_minimum", lambda *_: [])
     test = impact([SOFT, STIFF], HALVES, velocity=4.5, samples=201)
     result = ff.fit(test, model="auto", starts=4, intervals="local")
     assert result.ladder.chosen.name == "bistable+bistable without damping"

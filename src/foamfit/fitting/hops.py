@@ -16,6 +16,7 @@ from foamfit.arrays import Array
 from foamfit.fitting.box import Space
 from foamfit.fitting.levenberg import Iterate, descend
 from foamfit.fitting.objective import Objective
+from foamfit.fitting.starts import inner_part
 from foamfit.springs.model import Model, exchanges
 
 # Residual at a point of the box, and its derivative by the coordinates.
@@ -142,17 +143,21 @@ def _mixed(space: Space, one: Array, other: Array, rng: np.random.Generator) -> 
 
 
 def _far(space: Space, one: Array, _: Array, rng: np.random.Generator) -> Array:
-    """Return a point with one coordinate anywhere in the box."""
-    out, at, (low, high) = one.copy(), rng.integers(one.size), space.box
+    """Return a point with one coordinate anywhere in the inner part of the box."""
+    out, at, (low, high) = one.copy(), rng.integers(one.size), inner_part(space)
     out[at] = rng.uniform(low[at], high[at])
     return out
 
 
 def _beside(space: Space, one: Array, _: Array, rng: np.random.Generator) -> Array:
-    """Return a point with about half of the coordinates changed."""
-    far = 10.0 ** rng.uniform(-2.0, -0.5) * rng.standard_normal(one.size)
-    low, high = space.box
-    return np.clip(one + np.where(rng.random(one.size) < 0.5, far, 0.0) * (high - low), low, high)
+    """Return a point with about half of the coordinates changed, within the inner part of the box.
+
+    Further out lie stiff springs, which take long and need the implicit method.
+    """
+    low, high = inner_part(space)
+    far = 10.0 ** rng.uniform(-2.0, -0.5) * (high - low) * rng.standard_normal(one.size)
+    far *= rng.random(one.size) < 0.5
+    return np.clip(one + far, np.minimum(low, one), np.maximum(high, one))
 
 
 def neighbours(model: Model, values: Array, top: float) -> Iterator[Array]:

@@ -173,13 +173,18 @@ def _anywhere(space: Space, law: Law, marks: Array) -> Array:
 
 def box_starts(space: Space, rng: np.random.Generator, count: int) -> list[Array]:
     """Return a Latin hypercube over the inner part of the box, independent of the curves."""
+    low, high = inner_part(space)
+    return list(low + (high - low) * qmc.LatinHypercube(low.size, rng=rng).random(count))
+
+
+def inner_part(space: Space) -> Array:
+    """Return limits within which start values are drawn, (2, n)."""
     limits = [
         one.param.start_limits if one.param is not None
         else LATE if one.short == TIME_SHIFT else NEAR_USUAL
         for one in space.coordinates
     ]  # fmt: skip
-    low, high = np.array(limits).reshape(-1, 2).T
-    return list(low + (high - low) * qmc.LatinHypercube(low.size, rng=rng).random(count))
+    return np.array(limits).reshape(-1, 2).T
 
 
 def carried(space: Space, below: Space, minima: Iterable[Array]) -> list[Array]:
