@@ -157,7 +157,7 @@ def _beside(space: Space, one: Array, _: Array, rng: np.random.Generator) -> Arr
     low, high = inner_part(space)
     far = 10.0 ** rng.uniform(-2.0, -0.5) * (high - low) * rng.standard_normal(one.size)
     far *= rng.random(one.size) < 0.5
-    return np.clip(one + far, np.minimum(low, one), np.maximum(high, one))
+    return np.asarray(np.clip(one + far, np.minimum(low, one), np.maximum(high, one)))
 
 
 def neighbours(model: Model, values: Array, top: float) -> Iterator[Array]:
