@@ -19,7 +19,6 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.fitting import search
 from foamfit.fitting.curves import check_time_shift, choose_drive
-from foamfit.fitting.hops import has_several
 from foamfit.fitting.minima import in_order, scan_places, settle_ends
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params, make_problem
 from foamfit.fitting.search import STOPPING, SearchRecord, SearchStoppedError, Tracker, what_stopped
@@ -217,7 +216,7 @@ def identify(
     """
     began = time.perf_counter()
     problem = options.problem(measurement, model, params)
-    each = STARTS_IN_SERIES if has_several(problem.model) else STARTS
+    each = STARTS_IN_SERIES if problem.model.has_several else STARTS
     starts = each * len(problem.model.kinds) if options.starts is None else options.starts
     deadline = None if options.max_time is None else time.monotonic() + options.max_time
     better = None if options.watch is None else partial(options.watch, problem)

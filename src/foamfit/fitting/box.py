@@ -8,7 +8,7 @@ nuisance parameter runs between its limits.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -291,17 +291,6 @@ class Space:
             (begin, end), (least, most) = ends.ends(*[own[place] for place in one.of]), one.bounds
             own[one.place] = min(max(begin + point.item(j) * (end - begin), least), most)
         return self.complete(np.array(own))
-
-    def admit(self, values: Array, held: Collection[int] = ()) -> Array:
-        """Move dependent parameters between their ends, in place, and complete the vector.
-
-        Parameters with the indices `held` stay.
-        """
-        for one in self.coordinates:
-            if one.of and one.place not in held:
-                low, high = sorted(one.value(u, values) for u in one.limits)
-                values[one.place] = min(max(values[one.place], low), high)
-        return self.complete(values)
 
     def complete(self, values: Array) -> Array:
         """Set the parameters of a vector that depend on others through expressions."""

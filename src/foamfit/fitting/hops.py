@@ -6,7 +6,7 @@ few descents from start values end in the best minimum. There the hops also comb
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from operator import itemgetter
 
@@ -17,7 +17,7 @@ from foamfit.fitting.box import Space
 from foamfit.fitting.levenberg import Iterate, descend
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.starts import inner_part
-from foamfit.springs.model import Model, exchanges
+from foamfit.springs.model import exchanges
 
 # Residual at a point of the box, and its derivative by the coordinates.
 Functions = tuple[Callable[[Array], Array], Callable[[Array], Array]]
@@ -83,11 +83,6 @@ def under_stress(along: Objective, space: Space) -> Way:
     return stretched
 
 
-def has_several(model: Model) -> bool:
-    """Return whether a model has more than one hysteretic spring."""
-    return sum(law.hysteretic for law in model.laws) > 1
-
-
 def hop(
     space: Space, ends: Sequence[End], functions: Functions, rng: np.random.Generator,
     *more: Way, patience: int = PATIENCE,
@@ -97,7 +92,7 @@ def hop(
     `functions` are the residual and its derivative; `WAYS`, for springs in series `IN_SERIES`
     too, and `more` of them say how a child is made of two ends. Return all ends.
     """
-    ways = *WAYS, *(IN_SERIES if has_several(space.model) else ()), *more
+    ways = *WAYS, *(IN_SERIES if space.model.has_several else ()), *more
     pool, failed, out = [group[0] for group in grouped(ends, DIFFERENT)][:POOL], 0, [*ends]
     while failed < patience:
         best = pool[0][0]
@@ -118,7 +113,7 @@ def hop(
 
 
 def _crossed(space: Space, one: Array, other: Array, rng: np.random.Generator) -> Array:
-    """Return a point with a spring of another point, every second time with its height.
+    """Return a point with a spring of another point, in half of the cases with its height.
 
     Springs of one law are taken for each other. The last height follows from the others.
     """
@@ -158,18 +153,6 @@ def _beside(space: Space, one: Array, _: Array, rng: np.random.Generator) -> Arr
     far = 10.0 ** rng.uniform(-2.0, -0.5) * (high - low) * rng.standard_normal(one.size)
     far *= rng.random(one.size) < 0.5
     return np.asarray(np.clip(one + far, np.minimum(low, one), np.maximum(high, one)))
-
-
-def neighbours(model: Model, values: Array, top: float) -> Iterator[Array]:
-    """Yield parameters with nearly the same loop, from `Law.neighbours` of each spring.
-
-    `top` is the largest stress, Pa.
-    """
-    for spring, law in enumerate(model.laws):
-        for near in law.neighbours(model.own(spring, values)[:-1], top):
-            moved = values.copy()
-            model.own(spring, moved)[:-1] = near
-            yield moved
 
 
 WAYS: tuple[Way, ...] = _mixed, _far, _beside

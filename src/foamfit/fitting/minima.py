@@ -17,7 +17,6 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import Space
-from foamfit.fitting.hops import has_several
 from foamfit.fitting.levenberg import Iterate, following
 from foamfit.fitting.nuisance import CONTACT_TIME
 from foamfit.fitting.objective import Objective
@@ -105,7 +104,7 @@ def joint_minima(found: Together) -> list[Together]:
     that changes no curve of any test.
     """
     problems, links, model = found.problems, found.links, found.problems[0].model
-    if not has_several(model):
+    if not model.has_several:
         return [found]
     whole = Layout.of(problems, links)
     thin = Layout.of(tuple(problem.thinned() for problem in problems), links)

@@ -23,14 +23,12 @@ from foamfit.fitting.hops import (
     ALIKE,
     Functions,
     grouped,
-    has_several,
     hop,
-    neighbours,
     under_stress,
 )
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.starts import BOX_STARTS, Reading, box_starts, thinned
-from foamfit.springs.model import exchanges
+from foamfit.springs.model import exchanges, neighbours
 from foamfit.springs.parameters import NUISANCE
 
 Progress = Callable[[float, str], None]
@@ -43,10 +41,10 @@ ATTEMPTS = 3
 FOUND_AGAIN = 0.02  # relative difference of the costs of descents that agree on the best end
 NOISY = 0.005  # noise of a motion, as a fraction of its range, above which it is smoothed
 MISSING = 0.8  # fraction of the noise floor up to which a cost is mere noise
-NEWS = 1e-5  # relative fall of the cost by which a hop has found another minimum
 # Hops in a row on the curves that find nothing better, which ends them: of one spring, and where
-# there are many minima. MINIMA: the largest number of minima that is kept.
-SHORT, LONG, MINIMA = 40, 160, 24
+# there are many minima: of springs in series, or if the cost exceeds LOST noise floors (one in an
+# impact, as no law follows the waves in the specimen). MINIMA: the most minima that are kept.
+SHORT, LONG, LOST, MINIMA = 40, 160, 30.0, 24
 # Stages of successive halving: iterations, the share of the starts that then goes on, and that of
 # the work.
 STAGES = ((8, 0.5, 0.5), (8, 0.25, 0.25), (24, 0.25, 0.25))
@@ -145,6 +143,11 @@ class Tracker:
         """Call `looked` with the best point, if there are both."""
         if self.looked is not None and self.best_values is not None:
             self.looked(self.best_values)
+
+    def possible(self, values: Array) -> Array | None:
+        """Return the residual like `residual`; None if the simulation fails."""
+        failures, residual = self.objective.failures, self.residual(values)
+        return residual if self.objective.failures == failures else None
 
     def consider(self, values: Array) -> Array:
         """Return the residual of the objective, without a time limit."""
@@ -274,11 +277,11 @@ def search(
         if attempt + 1 == attempts or _settled(tracker, out, attempt, before, now):
             break
         points = box_starts(space, rng, BOX_STARTS)
-    several, floor = has_several(space.model), tracker.objective.floor
-    # Stress waves, which no law follows, give impacts many wrong minima.
-    errs = tracker.objective.measurement.striker is not None and tracker.best_cost > floor
+    several, objective = space.model.has_several, tracker.objective
+    least = objective.floor * (LOST if objective.measurement.striker is None else 1.0)
+    many = several or tracker.best_cost > least
     if not (several and known):  # springs of the poorer model were combined
-        out += leave_minimum(tracker, space, rng, LONG if several or errs else SHORT)
+        out += leave_minimum(tracker, space, rng, LONG if many else SHORT)
     return sorted(out)
 
 
@@ -296,7 +299,7 @@ def leave_minimum(
         return []
     functions = squares(tracker, space)
     ends = rank(tracker, space, [space.encode(values) for values in tracker.ends])
-    alike = exchanges if has_several(space.model) else partial(neighbours, top=space.scales.stress)
+    alike = exchanges if space.model.has_several else partial(neighbours, top=space.scales.stress)
     chains = alike(space.model, tracker.best_values)
     ends += halve(functions, space.box, [space.encode(values) for values in chains])
     every = hop(space, ends, functions, rng, patience=patience)
@@ -314,7 +317,7 @@ def _settled(
     rounds must agree, unless several ends agree on mere noise.
     """
     best, floor, agree = min(ends)[0], tracker.objective.floor, _agreeing(ends) > 1
-    if has_several(tracker.objective.model):
+    if tracker.objective.model.has_several:
         return (agree and best <= MISSING * floor) or abs(now - before) <= FOUND_AGAIN * best
     return agree or (attempt > 0 and best <= floor)
 
@@ -359,7 +362,7 @@ def _search_loop(
                 tracker.look()
 
         ends = halve(squares(inner, own), own.box, spread_out(own, points, starts), step)
-        if has_several(own.model) and not own.model.relaxation:
+        if own.model.has_several and not own.model.relaxation:
             ends = hop(own, ends, squares(inner, own), rng, under_stress(along, own))
         ends = [(cost, space.encode(own.decode(end))) for cost, end in ends]
     finally:

@@ -94,6 +94,11 @@ class Model:
         return "+".join(law.word or law.kind for law in self.laws)
 
     @property
+    def has_several(self) -> bool:
+        """Whether it has more than one hysteretic spring."""
+        return sum(law.hysteretic for law in self.laws) > 1
+
+    @property
     def options(self) -> dict[str, bool]:
         """The options that free further parameters of some spring; see `foamfit.options`."""
         return {name: any(name in kind.split(", ") for kind in self.kinds) for name in FREED}
@@ -207,6 +212,18 @@ def with_options(model: str, **options: bool) -> str:
                 f"none; take model {having[0]}, or leave {name} out"
             )
     return "+".join(laws.with_options(kind, asked) for kind in kinds)
+
+
+def neighbours(model: Model, values: Array, top: float) -> Iterator[Array]:
+    """Yield parameters with nearly the same loop, from `Law.neighbours` of each spring.
+
+    `top` is the largest stress, Pa.
+    """
+    for spring, law in enumerate(model.laws):
+        for near in law.neighbours(model.own(spring, values)[:-1], top):
+            moved = values.copy()
+            model.own(spring, moved)[:-1] = near
+            yield moved
 
 
 def exchanges(model: Model, values: Array) -> Iterator[Array]:

@@ -23,7 +23,6 @@ from foamfit.arrays import Array, Mask
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import Space
 from foamfit.fitting.branches import unreached
-from foamfit.fitting.hops import has_several
 from foamfit.fitting.links import Links
 from foamfit.fitting.minima import in_order, joint_minima
 from foamfit.fitting.problem import Problem
@@ -92,7 +91,7 @@ def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Kno
     if not draws:
         return known
     every = list[Explanation]()
-    if has_several(first.model) and any(one.fit for one in tests):
+    if first.model.has_several and any(one.fit for one in tests):
         for found in _explanations(tests, names):
             with suppress(SimulationError):  # it was found with less accuracy
                 every.append(explained(found.values))

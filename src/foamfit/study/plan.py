@@ -22,7 +22,6 @@ from foamfit.data.measurement import MEASURED, Measurement, Noise, Specimen, Str
 from foamfit.data.rig import Candidate, Rig, beyond, candidates, read_rig
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.branches import unreached
-from foamfit.fitting.hops import has_several
 from foamfit.fitting.minimizer import problem_of
 from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import make_params, make_problem
@@ -93,7 +92,7 @@ def plan(
     rng, test = np.random.default_rng(seed), tests[0].problem.measurement
     limits, asked = _candidates(tests[0], rivals, rig)
     progress(0.0, "drawing what the tests leave open")
-    several = has_several(tests[0].problem.model)
+    several = tests[0].problem.model.has_several
     known = known_of(tests, rng, FEWER_DRAWS if several else DRAWS)
     others = {name: known_of([one], rng, 0) for name, one in rivals.items()}
     target = None if quantity is None else gain.Target.of(quantity, known, limits)
@@ -124,8 +123,7 @@ def plan(
     if best is not None and known.explained is not None:
         progress(0.7, "other springs that would show the same")
         each = others_of(known, tests, asked[best], limits)
-        each_test = zip(asked, seen, strict=True)
-        seen = [with_others(known, each, *x, limits) for x in each_test]
+        seen = [with_others(known, each, *x, limits) for x in zip(asked, seen, strict=True)]
         outcomes, safe, best = judged(seen)
     pair = _pair(known, outcomes, seen, safe)
     progress(0.92, "what no test of this rig determines")

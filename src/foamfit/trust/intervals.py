@@ -332,8 +332,8 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
         own = point[best.places] = scaled * best.sizes
         if not np.all((own >= low) & (own <= high)):
             return -np.inf
-        failures, residual = objective.failures, tracker.residual(complete(point))
-        return -0.5 * float(weights @ residual**2) if objective.failures == failures else -np.inf
+        residual = tracker.possible(complete(point))
+        return -np.inf if residual is None else -0.5 * float(weights @ residual**2)
 
     count, k = walkers(best), len(best.names)
     sampler = emcee.EnsembleSampler(count, k, log_probability)

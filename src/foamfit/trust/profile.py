@@ -66,9 +66,7 @@ class Refit:
 
     def residual(self, point: Array) -> Array | None:
         """Return the residual at a point; None if the simulation fails."""
-        objective = self.tracker.objective
-        failures, residual = objective.failures, self.functions[0](point)
-        return residual if objective.failures == failures else None
+        return self.tracker.possible(self.space.decode(point))
 
     def shifted(self, near: Iterate, value: float) -> Iterate | None:
         """Return a point with the held parameter at a value; the others follow from a point `near`.
@@ -149,9 +147,9 @@ class _Side:
 
     @property
     def bracket(self) -> tuple[Iterate, Iterate | None]:
-        """The outermost refit below the cut, and the lowest beyond it; None if there is none.
+        """The outermost refit below the cut, and the lowest of those farther out, if there are any.
 
-        A nearer one above that has stalled.
+        A refit between the two that lies above the cut has stalled.
         """
         last = max(i for i, at in enumerate(self.refits) if self.root(at) < 1.0)
         return self.refits[last], min(self.refits[last + 1 :], key=self.root, default=None)
@@ -237,8 +235,8 @@ def trace(
     It uses the adjusted likelihood ratio: the rise of the cost over `Covariance.inflation` is a χ²
     of one degree of freedom even if noise is correlated (Chandler & Bate 2007, Biometrika 94, 167).
     `ci95` has the local end on a side that is not followed. If the deadline or Ctrl-C ends it
-    early, it is incomplete. A point of clearly
-    lower cost than the best one, if there is one, is returned too.
+    early, it is incomplete. A point of clearly lower cost than the best one, if there is one, is
+    returned too.
     """
     refit, stopped = Refit(best, tracker, name), None
     low, high = _Side(refit, -1.0), _Side(refit, 1.0)

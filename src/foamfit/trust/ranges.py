@@ -46,9 +46,9 @@ def alike(
     most, allowed = tolerance(best), tracker.objective.evaluations + budget
     out = [best.values]
     for point in minima:
-        failures, residual = tracker.objective.failures, tracker.residual(point)
-        rise = float(residual @ residual) - best.cost
-        out += [point] if rise <= most and tracker.objective.failures == failures else []
+        residual = tracker.possible(point)
+        if residual is not None and float(residual @ residual) - best.cost <= most:
+            out.append(point)
     inverse = np.linalg.pinv(best.scaled.T @ best.scaled, rcond=1e-12, hermitian=True)
     for (name, along), side in product(zip(best.names, inverse, strict=True), (0, 1)):
         if tracker.objective.evaluations < allowed:
