@@ -127,7 +127,8 @@ def shown(frame: pd.DataFrame, digits: int = 3) -> str:
     def cell(value: Any) -> str:
         if not isinstance(value, float):
             return str(value)
-        return "–" if np.isnan(value) else f"{value:.{digits}g}"
+        large = 10.0**digits <= abs(value) < 1e5
+        return "–" if np.isnan(value) else f"{value:.0f}" if large else f"{value:.{digits}g}"
 
     return markdown(frame.columns, (map(cell, row) for row in frame.astype(object).to_numpy()))
 

@@ -1,9 +1,9 @@
-"""What is the overhead of `foamfit batch`? Two processes against one, time per test, memory.
+"""What is the overhead of `foamfit batch`? Time per test and memory.
 
 Method and answer: README.md, whose numbers are in batch.json. The tests are copies of a
 reconstruction of foam-1.
 
-    python experiments/batch/batch.py               # all, some 15 minutes on two idle cores
+    python experiments/batch/batch.py               # both, some 10 minutes
     python experiments/batch/batch.py overhead      # one of them; see MEASURES
 """
 
@@ -28,7 +28,7 @@ import studies
 
 HERE = Path(__file__).parent
 TEST = HERE.parent / "foam-1" / "model-1-2.0mps-reconstruction.csv"
-TESTS, TINY, MANY = 24, 200, 1000
+TINY, MANY = 200, 1000
 
 
 def make_tests(folder: Path, count: int, linear: bool = False) -> None:
@@ -48,15 +48,15 @@ def size_of(folder: Path) -> dict[str, float]:
     return {"files": len(sizes), "kB": sum(sizes) / 1e3}
 
 
-def run(place: Path, *words: object) -> tuple[float, float, list[tuple[int, float, float]]]:
-    """Run the command; return its wall and processor time, and its memory ten times a second.
+def run(place: Path, *words: object) -> tuple[float, list[tuple[int, float, float]]]:
+    """Run the command; return its processor time, and its memory ten times a second.
 
     Each entry of the memory is the number of result folders, and the MiB of the command and of its
     largest process.
     """
     import psutil
 
-    sizes, began, used = list[tuple[int, float, float]](), time.perf_counter(), os.times()
+    sizes, used = list[tuple[int, float, float]](), os.times()
     command = [sys.executable, "-m", "foamfit", "batch", "tests", "--specimen", "foam.toml"]
     with subprocess.Popen([*command, "--quiet", *map(str, words)], cwd=place) as process:
         whole = psutil.Process(process.pid)
@@ -66,23 +66,7 @@ def run(place: Path, *words: object) -> tuple[float, float, list[tuple[int, floa
                 below = [one.memory_info().rss for one in whole.children(recursive=True)]
                 each = (whole.memory_info().rss, max(below, default=0))
                 sizes.append((len(os.listdir(place / "out")), *(rss / 2**20 for rss in each)))
-    return time.perf_counter() - began, sum(os.times()[2:4]) - sum(used[2:4]), sizes
-
-
-def measure_speedup(place: Path) -> dict[str, Any]:
-    """Compare one process with two, and check that the numbers agree."""
-    make_tests(place / "tests", TESTS)
-    took, values = {}, {}
-    for jobs in (1, 2):
-        out = place / f"out-{jobs}"
-        took[jobs] = run(place, "--jobs", jobs, "--out", out.name)[0]
-        values[jobs] = [file.read_bytes() for file in sorted(out.glob("*/parameters.csv"))]
-    return {
-        "tests": TESTS, "one": took[1], "two": took[2],
-        "share of ideal (clock)": took[1] / (2.0 * took[2]),
-        "same numbers": values[1] == values[2] and len(values[1]) == TESTS,
-        **size_of(place / "out-1" / "t00000"),
-    }  # fmt: skip
+    return sum(os.times()[2:4]) - sum(used[2:4]), sizes
 
 
 def measure_overhead(place: Path) -> dict[str, Any]:
@@ -112,16 +96,14 @@ def measure_memory(place: Path) -> dict[str, Any]:
     make_tests(place / "tests", MANY, linear=True)
     words = ("--starts", 1, "--model", "linear", "--drive", "displacement", "--no-report")
     words += ("--jobs", 2, "--out", "out")
-    sizes, at = run(place, *words)[2], {}
+    sizes, at = run(place, *words)[1], {}
     for wanted in (100, 500, MANY - 20):
         done, main, worker = min(sizes, key=lambda s, w=wanted: abs(s[0] - w))
         at[str(wanted)] = {"done": done, "command_MiB": main, "largest_process_MiB": worker}
-    return {"tests": MANY, "after": at, "again_cpu_s": run(place, *words)[1]}
+    return {"tests": MANY, "after": at, "again_cpu_s": run(place, *words)[0]}
 
 
-MEASURES = {
-    "speedup": measure_speedup, "overhead": measure_overhead, "memory": measure_memory,
-}  # fmt: skip
+MEASURES = {"overhead": measure_overhead, "memory": measure_memory}
 
 
 def main() -> None:

@@ -17,7 +17,6 @@ import pandas as pd
 from scipy import stats
 
 import foamfit as ff
-from foamfit.text import significant
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import records
@@ -47,23 +46,17 @@ def fitted(
 
 
 def twin_table(table: pd.DataFrame) -> str:
-    """Return mean and standard deviation by cycle, new and worn; how often it is determined."""
-    rows = []
-    for (name, cycle), group in table.groupby([table["specimen"].str.split("-").str[0], "cycle"]):
-        if len(group) < 5:
-            continue
-        shown = [name, str(cycle)]
-        for column in SHOWN:
-            m, s = group[column].mean(), group[column].std()
-            pressure = column.removeprefix("s1_").startswith(("k", "sigma", "dissipated"))
-            unit = 1e3 if pressure else 1.0  # kPa or kJ/m³
-            text = f"{significant(m / unit, 3)} ± {significant(s / unit, 2)}"
-            if column in NAMES:
-                text += f" ({(group[f'{column}_state'] == 'determined').sum()})"
-            shown.append(f"{100 * m:.2f} ± {100 * s:.2f} %" if column in SHARES else text)
-        rows.append(shown)
-    head = ["", "cycle", "start strain", "dissipated (kJ/m³)", "misfit", *(n[3:] for n in NAMES)]
-    return studies.markdown(head, rows) + "\n\nStiffnesses and stresses in kPa, tau1 in s."
+    """Return mean and standard deviation by cycle, of new and worn heels; kPa, kJ/m³ and %."""
+    pressures = ("k", "sigma", "dissipated")
+    factors = [
+        100.0 if name in SHARES else 1e-3 if name.removeprefix("s1_").startswith(pressures) else 1.0
+        for name in SHOWN
+    ]
+    by = [table["specimen"].str.partition("-")[0], table["cycle"]]
+    groups = (table[list(SHOWN)] * factors).groupby(by)
+    cells = groups.mean().map("{:.3g}".format) + " ± " + groups.std().map("{:.3g}".format)
+    head = ["", "cycle", "start strain (%)", "dissipated", "misfit (%)", *(n[3:] for n in NAMES)]
+    return studies.markdown(head, cells.reset_index().to_numpy())
 
 
 def changed(group: pd.DataFrame, column: str, first: int, last: int) -> tuple[float, float, int]:
@@ -103,30 +96,33 @@ def worn_table(table: pd.DataFrame, cycle: int) -> str:
     order = np.argsort(found.pvalue)
     left = len(WORN) - np.arange(len(WORN))
     corrected = np.maximum.accumulate(np.minimum(left * found.pvalue[order], 1.0))
-    rows = []
-    for i, holm in zip(order, corrected, strict=True):
-        text = "{:+.0f} % ({:+.0f} to {:+.0f} %)".format(*(100.0 * change[i])).replace("-", "−")
-        p_values = (significant(p, 2) for p in (found.pvalue[i], holm))
-        rows.append([f"`{WORN[i].removeprefix('s1_')}`", text, *p_values])
-    return studies.markdown(f"cycle {cycle} | worn over new, less one | p | p, corrected", rows)
+    texts = ["{:+.0f} % ({:+.0f} to {:+.0f} %)".format(*row) for row in 100.0 * change[order]]
+    return studies.shown(pd.DataFrame({
+        f"cycle {cycle}": [f"`{WORN[i].removeprefix('s1_')}`" for i in order],
+        "worn over new, less one": [text.replace("-", "−") for text in texts],
+        "p": found.pvalue[order], "p, corrected": corrected,
+    }), 2)  # fmt: skip
 
 
 def lattice_table(table: pd.DataFrame) -> str:
-    head = "lattice | cycle | start strain | peak stress (kPa) | dissipated (kJ/m³) | misfit"
-    rows = (
-        (row.specimen, row.cycle, f"{100 * row.start_strain:.1f} %", f"{row.peak_stress / 1e3:.0f}",
-         f"{row.dissipated_energy / 1e3:.1f}", f"{100 * row.misfit_stress_strain:.2f} %")
-        for row in table.itertuples()
-    )  # fmt: skip
-    return studies.markdown(head, rows)
+    return studies.shown(pd.DataFrame({
+        "lattice": table["specimen"], "cycle": table["cycle"],
+        "start strain (%)": 100.0 * table["start_strain"],
+        "peak stress (kPa)": 1e-3 * table["peak_stress"],
+        "dissipated (kJ/m³)": 1e-3 * table["dissipated_energy"],
+        "misfit (%)": 100.0 * table["misfit_stress_strain"],
+    }))  # fmt: skip
 
 
 def lattice_changes(table: pd.DataFrame) -> str:
+    text = (
+        "- From cycle {} to {} the peak stress changes by a factor of {:.2f}, the dissipated "
+        "energy by {:.2f} (mean of three lattices)."
+    )
+    columns = ("peak_stress", "dissipated_energy")
+    pairs = ((1, 2), (2, 1000))
     return "\n".join(
-        f"- From cycle {first} to {last} the peak stress changes by a factor of "
-        f"{changed(table, 'peak_stress', first, last)[0]:.2f}, the dissipated energy by "
-        f"{changed(table, 'dissipated_energy', first, last)[0]:.2f} (mean of three lattices)."
-        for first, last in ((1, 2), (2, 1000))
+        text.format(*two, *(changed(table, column, *two)[0] for column in columns)) for two in pairs
     )
 
 

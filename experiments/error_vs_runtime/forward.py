@@ -45,7 +45,7 @@ HEIGHT, AREA = MODEL_2.chain.height, MODEL_2.chain.area
 
 PUBLIC, KERNEL, SCIPY, HEYOKA = "foamfit simulate", "foamfit kernel", "SciPy", "heyoka"
 WANTED = 2e-6  # the error at which solvers are compared
-ROUNDS = 40
+ROUNDS, BUDGET = 40, 6.0  # turns, and seconds of turns of a scene
 SHORTEST = 2e-3  # s; shorter runs are timed in groups
 BRIEF = 1e-2  # s; shorter runs are preceded by an untimed run
 SLOW = 1.0  # s; longer runs are made once
@@ -104,9 +104,17 @@ def graded(count: int, mass: float = 0.0, eta: float = 0.0) -> ff.Chain:
 
 
 def scenes() -> list[Scene]:
-    """Return all scenes, small ones first."""
+    """Return scenes of bistable springs, and of a microscale spring like shoe foam."""
     t = np.linspace(0.0, LENGTH, SAMPLES)
     one, two = ff.Chain([MODEL_2.bistable], [HEIGHT], AREA), MODEL_3.chain
+    law = (5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77)
+    height, area = 25e-3, 1.6e-3
+    plain, slow, quick = (
+        ff.MicroscaleSpring(*law, relaxation=each) for each in ((), [(0.5, 0.2)], [(0.5, 0.01)])
+    )
+    struck, pressed = np.linspace(0.0, 0.08, SAMPLES), np.linspace(0.0, 2.0, 1280)
+    motion = 0.6 * height * np.sin(np.pi * pressed) ** 2 * np.where(pressed < 1.0, 1.0, 0.8)
+    on_linear = ff.Chain([ff.LinearSpring(5e6), quick], [0.2 * height, 0.8 * height], area)
     return [
         Scene("one_spring_impact", "one spring, impact at 2.0 m/s", one, ff.Impact(MASS, 2.0), t),
         Scene("two_springs_mass_impact",
@@ -118,21 +126,6 @@ def scenes() -> list[Scene]:
               outside=powers(5, 11), longest=0.6),
         Scene("1000_springs_impact", "1000 springs, impact at 2.2 m/s", graded(1000),
               ff.Impact(MASS, 2.2), t, own=(1e-6, 1e-10), outside=(), longest=4.0),
-    ]  # fmt: skip
-
-
-def scenes_with_memory() -> list[Scene]:
-    """Return scenes of a microscale spring like shoe foam; two of three with relaxation."""
-    law = (5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77)
-    height, area = 25e-3, 1.6e-3
-    plain, slow, quick = (
-        ff.MicroscaleSpring(*law, relaxation=each) for each in ((), [(0.5, 0.2)], [(0.5, 0.01)])
-    )
-    struck = np.linspace(0.0, 0.08, SAMPLES)
-    pressed = np.linspace(0.0, 2.0, 1280)
-    motion = 0.6 * height * np.sin(np.pi * pressed) ** 2 * np.where(pressed < 1.0, 1.0, 0.8)
-    on_linear = ff.Chain([ff.LinearSpring(5e6), quick], [0.2 * height, 0.8 * height], area)
-    return [
         Scene("microscale_impact", "one microscale spring, impact at 1.5 m/s",
               ff.Chain([plain], [height], area), ff.Impact(2.0, 1.5), struck),
         Scene("microscale_relaxation_displacement",
@@ -197,58 +190,38 @@ def error_of(answer: Answer, truth: Answer) -> float:
     return float(max(misses)) if np.isfinite(misses).all() else math.inf
 
 
-class Timed(NamedTuple):
-    """A solver at one tolerance with its error, an approximate time, and its measured times."""
-
-    solver: str
-    tolerance: float
-    run: Callable[[], Answer]
-    error: float
-    first: float
-    times: list[float]
-
-    def row(self) -> dict[str, Any]:
-        """Return a row of the table."""
-        quartiles = np.percentile(self.times or [self.first], [50, 25, 75])
-        found = {"solver": self.solver, "setting": f"rtol = {self.tolerance:.0e}"}
-        return found | {"error": self.error, **dict(zip(TIMES, quartiles, strict=True))}
-
-
 def seconds(run: Callable[[], object], times: int = 1) -> float:
     """Return the processor time of a run, s."""
     return timeit(run, timer=time.process_time, number=times) / times
 
 
-def measure(scene: Scene, budget: float) -> pd.DataFrame:
-    """Return error and time of every solver in a scene at every tolerance."""
-    truth, timed = reference(scene), list[Timed]()
+def measure(scene: Scene) -> pd.DataFrame:
+    """Return error and time of every solver in a scene at every tolerance; they take turns."""
+    truth, found = reference(scene), list[tuple[dict[str, Any], Callable[[], Answer], float]]()
     for solver, runs in solvers(scene).items():
         for tolerance, run in runs.items():
             try:
-                answer = run()  # compiles
-                first = seconds(run)
+                error, first = error_of(run(), truth), seconds(run)  # the first compiles
             except (RuntimeError, ff.SimulationError):  # unstable, or past a pole
                 continue
-            error = error_of(answer, truth)
             if error < 1.0:
-                timed.append(Timed(solver, tolerance, run, error, first, []))
+                about = {"solver": solver, "setting": f"rtol = {tolerance:.0e}", "error": error}
+                found.append((about, run, first))
             if first > scene.longest:
                 break
-    take_turns(timed, budget)
-    return pd.DataFrame([one.row() for one in timed])
-
-
-def take_turns(timed: list[Timed], budget: float) -> None:
-    """Time all solvers in turn, as often as each one's share of the budget (s) allows."""
-    share = budget / len(timed)
-    for turn, one in product(range(ROUNDS), timed):
-        together = max(1, round(SHORTEST / one.first))
-        count = min(max(round(share / (one.first * together)), 3), ROUNDS)
-        count = count if one.first < SLOW else 0
-        if (turn + 1) * count // ROUNDS > turn * count // ROUNDS:
-            if one.first < BRIEF:  # the previous run has displaced the caches
-                one.run()
-            one.times.append(seconds(one.run, together))
+    took: list[list[float]] = [[first] if first > SLOW else [] for *_, first in found]
+    for turn, ((_, run, first), times) in product(range(ROUNDS), zip(found, took, strict=True)):
+        together = max(1, round(SHORTEST / first))
+        rest = round(ROUNDS * first * together * len(found) / BUDGET)  # turns that a slow one skips
+        if first <= SLOW and turn % min(max(rest, 1), ROUNDS // 3) == 0:
+            if first < BRIEF:  # the previous run has displaced the caches
+                run()
+            times.append(seconds(run, together))
+    quartiles = (np.percentile(times, [50, 25, 75]) for times in took)
+    return pd.DataFrame(
+        about | dict(zip(TIMES, three, strict=True))
+        for (about, *_), three in zip(found, quartiles, strict=True)
+    )
 
 
 def draw_scene(table: pd.DataFrame, title: str, path: Path) -> None:
@@ -311,7 +284,7 @@ def compare(scene: Scene, table: pd.DataFrame) -> dict[str, object]:
 
 def main() -> None:
     """Measure and draw the scenes; write the page if all were asked for."""
-    parser = studies.arguments(__doc__, HERE, budget=(6.0, "seconds of turns a scene"))
+    parser = studies.arguments(__doc__, HERE)
     parser.add_argument("scenes", nargs="*", help="names; left out = all, and the page")
     parser.add_argument("--scaling", action="store_true", help="time by springs and samples alone")
     options = parser.parse_args()
@@ -319,19 +292,18 @@ def main() -> None:
     if options.scaling:
         print(studies.shown(scaling()))
         return
-    folder, wanted = options.out / "forward", [*scenes(), *scenes_with_memory()]
-    wanted = [scene for scene in wanted if scene.name in (options.scenes or [scene.name])]
+    folder, rows, figures = options.out / "forward", list[dict[str, object]](), list[str]()
     folder.mkdir(parents=True, exist_ok=True)
-    rows, figures = [], []
-    for scene in wanted:
-        print(scene.name, file=sys.stderr)
-        table = measure(scene, options.budget)
+    for scene in scenes():
+        if scene.name not in (options.scenes or [scene.name]):
+            continue
+        table = measure(scene)
         studies.write_csv(table, folder / f"{scene.name}.csv")
         draw_scene(table, scene.title, folder / f"{scene.name}.png")
         figures.append(f"![Error against run time: {scene.title}](forward/{scene.name}.png)")
         rows.append(compare(scene, table))
+        print(rows[-1], flush=True)
     if options.scenes:
-        print(studies.shown(pd.DataFrame(rows)))
         return
     summary = pd.DataFrame(rows)
     studies.write_csv(summary, folder / "summary.csv")

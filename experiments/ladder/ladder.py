@@ -163,15 +163,12 @@ def main() -> None:
         table = studies.said(studies.in_order(climb, jobs, 2))
         studies.write_csv(table, options.out / "structures.csv")
     table = pd.read_csv(options.out / "structures.csv")
-    clear, rows = table[table["clear"]], structure_table(table)
-    counts = pd.crosstab(table["structure"], table["chosen"]).reset_index()
+    clear = table[table["clear"]]
     studies.write_page(
-        HERE, options.out, samples=SAMPLES,
-        damping=100 * CLEAR_DAMPING, misfit=CLEAR_MISFIT, structures=rows,
+        HERE, options.out, samples=SAMPLES, structures=structure_table(table),
+        damping=100 * CLEAR_DAMPING, misfit=CLEAR_MISFIT,
         found=int(clear["found"].sum()), clear=len(clear), rate=100 * clear["found"].mean(),
-        confusion=studies.markdown(counts.columns, counts.to_numpy()),
     )  # fmt: skip
-    print(rows, f"{clear['found'].sum()} of {len(clear)} clear tests found", sep="\n")
 
 
 if __name__ == "__main__":

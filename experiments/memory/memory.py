@@ -1,7 +1,7 @@
 """Do springs that remember describe all cycles of a foam with one set of parameters?
 
-Method and answer: README.md. Also written: memory.csv (a row for each cycle of each specimen),
-parameters.csv (every parameter of every fit) and memory.png.
+Method and answer: README.md. Also written: memory.csv (a row for each cycle of each specimen) and
+memory.png.
 
     FOAMFIT_DATA=… python experiments/memory/memory.py          # --page: from the tables alone
 """
@@ -21,11 +21,10 @@ from foamfit.results import Fit
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import records
 import studies
-from real_foams import varied
 from records import HEELS, SOURCE
 
 HERE = Path(__file__).parent
-TABLE, PARAMETERS = HERE / "memory.csv", HERE / "parameters.csv"
+TABLE = HERE / "memory.csv"
 SHOWN = "new-heel-comp-3"  # in the picture
 FIRST, HISTORY, PREDICTED = "first cycle", "cycles 1 to 3", "predicted"
 # Specimens on which the growth of the band was chosen.
@@ -47,19 +46,12 @@ def misfits(test: ff.Measurement, result: Fit) -> dict[int, float]:
 
 
 def study() -> None:
-    """Fit and predict; both tables are written row by row."""
-    rows, values = list[dict[str, Any]](), list[dict[str, Any]]()
+    """Fit and predict; the table is written row by row."""
+    rows = list[dict[str, Any]]()
 
-    def add(test: str, what: str, more: list[dict[str, Any]], result: Fit) -> None:
-        about = {"test": test, "what": what}
-        rows.extend(about | row for row in more)
-        values.extend(
-            about | {"parameter": name, "value": p.value, "stderr": p.stderr, "unit": p.unit,
-                     "state": p.state}
-            for name, p in (varied(result) if what != PREDICTED else {}).items()
-        )  # fmt: skip
+    def add(test: str, what: str, more: list[dict[str, Any]]) -> None:
+        rows.extend({"test": test, "what": what} | row for row in more)
         studies.write_csv(rows, TABLE)
-        studies.write_csv(values, PARAMETERS)
         print(test, what, *(f"{100.0 * row['misfit']:.2f} %" for row in more), flush=True)
 
     with studies.workplace() as folder:
@@ -67,7 +59,7 @@ def study() -> None:
             result, seconds = studies.timed(ff.fit, test, **MEMORY, relaxation=1)
             miss = misfits(test, result)[test.cycle]
             row = {"cycle": 1, "misfit": miss, "inside": np.nan, "seconds": seconds}
-            add(test.name, FIRST, [row], result)
+            add(test.name, FIRST, [row])
         for name in ("turbo-comp-1 cycles", *HEELS):
             file, specimen = records.place(name, folder), name.removesuffix(" cycles")
             test = ff.read_test(file, cycles=(1, 3))
@@ -75,36 +67,35 @@ def study() -> None:
             later = ff.predict(result, ff.read_test(file, cycles=(1, 5)))
             whole = {"cycle": "1-3", "misfit": result.misfit["stress_strain"], "seconds": seconds}
             each = [{"cycle": n, "misfit": m} for n, m in misfits(test, result).items()]
-            add(specimen, HISTORY, [whole, *each], result)
+            add(specimen, HISTORY, [whole, *each])
             cycles = [{"cycle": n, **one} for n, one in later.by_cycle.items() if n > 3]
-            add(specimen, PREDICTED, cycles, result)
+            add(specimen, PREDICTED, cycles)
             if specimen == SHOWN:
                 plot_prediction(later).savefig(HERE / "memory.png", dpi=200)
 
 
 def summary(table: pd.DataFrame) -> str:
-    """Return mean and worst misfit of each part with the goals."""
+    """Return mean and worst misfit of each part with the goals, and samples inside the band."""
     rows = []
     for what, (mean, worst) in BARS.items():
         own = table[(table["what"] == what) & ((what != HISTORY) | (table["cycle"] == "1-3"))]
         miss, inside = (100.0 * own[one].astype(float) for one in ("misfit", "inside"))
-        shown = f"{inside.min():.0f}–{inside.max():.0f} %" if what == PREDICTED else "–"
-        rows.append([
-            what, own["test"].nunique(), f"{miss.mean():.2f} % (≤ {mean:.2f})",
-            f"{miss.max():.2f} % (≤ {worst:.2f})", shown,
-        ])  # fmt: skip
-    head = "what | specimens | mean misfit (goal) | worst misfit (goal) | samples inside the band"
-    return studies.markdown(head, rows)
+        rows.append({
+            "what": what, "specimens": own["test"].nunique(),
+            "mean misfit (goal), %": f"{miss.mean():.2f} (≤ {mean:.2f})",
+            "worst misfit (goal), %": f"{miss.max():.2f} (≤ {worst:.2f})",
+            "least inside the band, %": inside.min(), "most": inside.max(),
+        })  # fmt: skip
+    return studies.shown(pd.DataFrame(rows))
 
 
 def per_specimen(table: pd.DataFrame) -> str:
-    wide = table[table["what"] != FIRST].assign(cycle=table["cycle"].astype(str))
+    """Return misfit of each cycle, and samples of predicted ones inside the band, in %."""
+    wide = table[table["what"] != FIRST].assign(cycle="cycle " + table["cycle"].astype(str))
     made = wide.pivot_table(index="test", columns="cycle", values=["misfit", "inside"], sort=False)
-    misfit, inside = 100.0 * made["misfit"], 100.0 * made["inside"][["4", "5"]]
-    names = [f"cycle {c}" if len(c) == 1 else "cycles 1 to 3" for c in misfit.columns]
-    cells = misfit.map("{:.2f}".format).join(inside.map("{:.1f}".format), rsuffix=" inside")
-    head = ["specimen", *names, *(f"inside {c}" for c in inside.columns)]
-    return studies.markdown(head, cells.reset_index().to_numpy())
+    cells = 100.0 * made.dropna(axis="columns", how="all")
+    cells.columns = [cycle + " inside" * (what == "inside") for what, cycle in cells.columns]
+    return studies.shown(cells.reset_index())
 
 
 def coverage(predicted: pd.DataFrame) -> str:
@@ -117,26 +108,15 @@ def coverage(predicted: pd.DataFrame) -> str:
     )
 
 
-def values_table(values: pd.DataFrame) -> str:
-    """Return mean and scatter between specimens of each parameter, from cycles 1 to 3."""
-    own = values[values["what"] == HISTORY]
-    foam, by = own["test"].str.rpartition("-comp")[0], own["parameter"]
-    found = own["value"].groupby([by, foam], sort=False).agg(["mean", "std"])
-    scatter = found["std"].map(" ± {:.2g}".format, na_action="ignore").fillna("")
-    cells = (found["mean"].map("{:.3g}".format) + scatter).unstack(sort=False)
-    cells["determined / weak / not"] = own["state"].groupby(by, sort=False).agg(studies.counted)
-    return studies.markdown(["parameter", *cells.columns], cells.reset_index().to_numpy())
-
-
 def main() -> None:
     if not studies.arguments(__doc__, page=True).parse_args().page:
         studies.measurements("shoe-foam", "shoe-foam-twins")
         study()
-    table, values = pd.read_csv(TABLE), pd.read_csv(PARAMETERS)
+    table = pd.read_csv(TABLE)
     took = table[table["what"] == HISTORY]["seconds"].dropna()
     studies.write_page(
         HERE, source=SOURCE, summary=summary(table), specimens=per_specimen(table),
-        values=values_table(values), inside=coverage(table[table["what"] == PREDICTED]),
+        inside=coverage(table[table["what"] == PREDICTED]),
         seconds=f"{took.min():.0f} to {took.max():.0f} s, {took.mean():.0f} s on average,",
         verified=coverage(table[(table["what"] == PREDICTED) & ~table["test"].isin(CHOSEN)]),
     )  # fmt: skip

@@ -1,6 +1,6 @@
 """Do discrete micro-springs converge to the microscale spring, and do their inner loops close?
 
-Method and answer: README.md. Also written: microscale.csv and microscale.png.
+Method and answer: README.md. Also written: microscale.png.
 
     python experiments/microscale/microscale.py
 """
@@ -48,11 +48,10 @@ def history(between: int = BETWEEN) -> Array:
     return np.concatenate([[0.0], *legs])
 
 
-def errors(n: int) -> tuple[float, float]:
-    """Return largest and RMS difference of strain between n micro-springs and the law."""
+def error(n: int) -> float:
+    """Return the largest difference of strain between n micro-springs and the law."""
     stress = history()
-    miss = followed(n, stress) - SPRING.strain(stress)
-    return float(np.abs(miss).max()), float(np.sqrt(np.mean(miss**2)))
+    return float(np.abs(followed(n, stress) - SPRING.strain(stress)).max())
 
 
 def returns(n: int | None) -> float:
@@ -63,13 +62,12 @@ def returns(n: int | None) -> float:
     return max(abs(strain[b] - strain[a]) for a, b in ((1, 7), (2, 6), (3, 5), (8, 12)))
 
 
-def rate(table: list[tuple[int, float, float]], column: int) -> float:
+def rate(errors: dict[int, float]) -> float:
     """Return the slope of log error over log n."""
-    n, error = np.log([row[0] for row in table]), np.log([row[column] for row in table])
-    return float(np.polyfit(n, error, 1)[0])
+    return float(np.polyfit(np.log(list(errors)), np.log(list(errors.values())), 1)[0])
 
 
-def draw(table: list[tuple[int, float, float]], path: Path) -> None:
+def draw(errors: dict[int, float], path: Path) -> None:
     """Draw loops of a few micro-springs on those of the law, and the error against n."""
     with studies.sheet(path, 7.0, 3.0, 150) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.35, 1.0))
@@ -79,26 +77,21 @@ def draw(table: list[tuple[int, float, float]], path: Path) -> None:
         left.plot(few, along / 1e3, color=BLUE, lw=0.9, label=f"{SHOWN} micro-springs")
         left.set(xlabel="strain (%)", ylabel="stress (kPa)", title="(a) a loop with inner loops")
         left.legend(loc="upper left")
-        n = np.array([row[0] for row in table])
-        for column, color, label in ((1, VERMILION, "largest"), (2, BLUE, "RMS")):
-            values = [row[column] for row in table]
-            right.loglog(n, values, "o-", color=color, ms=3, lw=1, label=label)
-        right.loglog(n, 0.3 * table[0][1] * n[0] / n, "--", color=GREY, lw=0.8, label="1/n")
+        n, values = np.array(list(errors)), np.array(list(errors.values()))
+        right.loglog(n, values, "o-", color=VERMILION, ms=3, lw=1, label="largest")
+        right.loglog(n, 0.5 * values[0] * n[0] / n, "--", color=GREY, lw=0.8, label="1/n")
         right.set(xlabel="micro-springs n", ylabel="difference in strain", title="(b) convergence")
         right.legend()
 
 
 def main() -> None:
-    table = [(n, *errors(n)) for n in NUMBERS]
-    names = ("micro-springs", "largest difference", "RMS difference")
-    rows = [dict(zip(names, row, strict=True)) for row in table]
-    studies.write_csv(rows, HERE / "microscale.csv", 6)
-    draw(table, HERE / "microscale.png")
-    lines = ((n, f"{a:.2e}", f"{b:.2e}", f"{a * n:.3f}") for n, a, b in table)
+    errors = {n: error(n) for n in NUMBERS}
+    draw(errors, HERE / "microscale.png")
+    rows = ((n, f"{size:.2e}", f"{size * n:.3f}") for n, size in errors.items())
     studies.write_page(
-        HERE, rate_largest=-rate(table, 1), rate_rms=-rate(table, 2), last=table[-1][1],
-        most=NUMBERS[-1], returns_law=returns(None),
-        returns_chain=max(returns(n) for n in NUMBERS), table=studies.lines(lines),
+        HERE, rate=-rate(errors), last=errors[NUMBERS[-1]], most=NUMBERS[-1],
+        returns_law=returns(None), returns_chain=max(map(returns, NUMBERS)),
+        table=studies.lines(rows),
     )  # fmt: skip
 
 

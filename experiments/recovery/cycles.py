@@ -123,11 +123,6 @@ class Cycled:
     truth: dict[str, float]
     table: pd.DataFrame
 
-    @property
-    def time(self) -> pd.Series:
-        """Times of the samples, s."""
-        return self.table["time (s)"]
-
     def write(self, folder: Path) -> Path:
         """Write CSV and TOML; return the path of the CSV."""
         path = folder / "test.csv"

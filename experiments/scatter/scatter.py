@@ -65,20 +65,20 @@ def along(test: ff.Measurement, other: ff.Measurement) -> np.ndarray:
 def page(frame: pd.DataFrame) -> None:
     """Write the page from all rows."""
     ratio, t_alone = frame.half_width / frame.half_width_simple, np.sqrt(1.0 + 1.0 / (COUNT - 1))
-    rows = (
-        [r.specimen, percent(r.inside, 3), f"±{percent(r.half_width)}", percent(r.inside_simple, 3),
-         f"±{percent(r.half_width_simple)}", f"{r.half_width / r.half_width_simple:.2f}",
-         f"{r.half_width / r.half_width_simple * t_alone:.2f}"]
-        for r in frame.itertuples()
-    )  # fmt: skip
+    table = pd.DataFrame({
+        "left out": frame.specimen, "inside (%)": 100.0 * frame.inside,
+        "band (±%)": 100.0 * frame.half_width, "inside the simple band (%)":
+        100.0 * frame.inside_simple, "simple band (±%)": 100.0 * frame.half_width_simple,
+        "ratio": ratio, "to ± t s": ratio * t_alone,
+    })  # fmt: skip
     good = frame[frame.inside >= 0.93]
     inside, simple = (np.average(frame[one], weights=frame.samples)
                       for one in ("inside", "inside_simple"))  # fmt: skip
     studies.write_page(
-        HERE, rows=studies.lines(rows),
-        inside=percent(float(inside), 3), simple=percent(float(simple), 3),
-        median=ratio.median(), least=ratio.min(), most=ratio.max(),
-        few=len(frame) - len(good), count=len(frame), rest=percent(good.inside.min(), 3),
+        HERE, table=studies.shown(table), inside=percent(float(inside), 3),
+        simple=percent(float(simple), 3), median=ratio.median(), least=ratio.min(),
+        most=ratio.max(), few=len(frame) - len(good), count=len(frame),
+        rest=percent(good.inside.min(), 3),
     )  # fmt: skip
 
 
