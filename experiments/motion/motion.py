@@ -2,12 +2,12 @@
 
 Method and answer: README.md, which 225 draws of each class (a minute) write.
 
-    python experiments/motion/motion.py --draws 25
-    python experiments/motion/motion.py --draws 4      # prints the tables only
+    python experiments/motion/motion.py
+    python experiments/motion/motion.py --draws 4 --out FOLDER
 """
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -133,8 +133,8 @@ def matched(motion: Motion, turns: np.ndarray) -> list[tuple[int, int]]:
     return pairs
 
 
-def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterator[dict]:
-    """Smooth one noisy motion; yield a row for it and one for each true turning point."""
+def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> dict[str, float]:
+    """Smooth one noisy motion; return its errors in units of the noise."""
     motion, t = CLASSES[name](rng), np.linspace(0.0, 1.0, rows)
     if rng.random() < 0.3:  # uneven sampling
         t[1:-1] += rng.uniform(-0.33, 0.33, rows - 2) / rows
@@ -142,103 +142,58 @@ def one(name: str, rows: int, noise: float, rng: np.random.Generator) -> Iterato
     noisy = true + noise * rng.standard_normal(rows)
     found, seconds = studies.timed(follow, t, noisy, NoiseLevel(noise, True, ""))
     off = found.at(t) - true
-    stderr = np.linalg.norm(found.modes(t), axis=1)
-    held = np.abs(off) < Z95 * stderr
+    held = np.abs(off) < Z95 * np.linalg.norm(found.modes(t), axis=1)
     near = np.any(np.abs(t[:, None] - motion.turns) < NEAR, axis=1)
     for a, b in motion.holds:
         near |= (t > a - NEAR) & (t < b + NEAR)
-    pairs = matched(motion, found.turns)
-    fine = np.linspace(0.0, 1.0, 7 * rows)
-    steps = np.diff(found.at(np.union1d(fine, found.turns)))
-    stretch = np.searchsorted(found.turns, np.union1d(fine, found.turns)[:-1], side="right")
-    back = max(
-        float(min(np.maximum(-part, 0.0).max(), np.maximum(part, 0.0).max()))
+    some, pairs = bool(near.any()), matched(motion, found.turns)
+    fine = np.union1d(np.linspace(0.0, 1.0, 7 * rows), found.turns)
+    steps, stretch = np.diff(found.at(fine)), np.searchsorted(found.turns, fine[:-1], side="right")
+    back = (  # the largest step against the direction of each stretch between turning points
+        min(np.maximum(-part, 0.0).max(), np.maximum(part, 0.0).max())
         for part in (steps[stretch == k] for k in np.unique(stretch))
     )
-    row = {"class": name, "rows": rows, "noise": noise, "ms": 1e3 * seconds}
-    yield row | {
-        "what": "motion", "rms": off / noise @ off / noise / rows,
-        "near": float(np.mean((off[near] / noise) ** 2)) if near.any() else np.nan,
-        "held": held.mean(), "held_near": held[near].mean() if near.any() else np.nan,
-        "worst": np.abs(off).max() / noise,
-        "invented": len(found.turns) - len(pairs), "back": back,
-        "modes": found.modes(t[:1]).shape[1],
+    heights = [
+        (found.at(here)[0] - motion.at(motion.turns[i : i + 1])[0]) / np.linalg.norm(
+            found.modes(here))
+        for i, j in pairs for here in [found.turns[j : j + 1]]
+    ]  # fmt: skip
+    return {
+        "mean square": float(np.mean((off / noise) ** 2)),
+        "near": float(np.mean((off[near] / noise) ** 2)) if some else np.nan,
+        "worst": np.abs(off).max() / noise, "held": held.mean(),
+        "held near": held[near].mean() if some else np.nan,
+        "heights": len(heights), "heights held": int(np.sum(np.abs(heights) < Z95)),
+        "invented": len(found.turns) - len(pairs), "back": max(back), "ms": 1e3 * seconds,
     }  # fmt: skip
-    ends = np.concatenate([[0.0], motion.turns, [1.0]])
-    heights = motion.at(ends)
-    sizes, lasts = np.abs(np.diff(heights)), np.diff(ends)
-    for i, (at, height) in enumerate(zip(motion.turns, heights[1:-1], strict=True)):
-        j = dict(pairs).get(i)
-        turn = row | {
-            "what": "turn", "size": min(sizes[i : i + 2]) / noise, "found": j is not None,
-            "samples": rows * min(lasts[i : i + 2]),
-        }  # fmt: skip
-        if j is not None:
-            here = found.turns[j : j + 1]
-            over = float(np.sign(height - heights[i]) * (found.at(here)[0] - height))
-            turn["height"] = over / noise
-            turn["height_z"] = over / np.linalg.norm(found.modes(here))
-            if not motion.holds.size:
-                turn["late"] = rows * float(here[0] - at)
-        yield turn
 
 
 def table(data: pd.DataFrame, by: str) -> pd.DataFrame:
     """Return means over draws."""
-    motions, turns = data[data.what == "motion"], data[data.what == "turn"]
-    m = motions.groupby(by, sort=False)
-    f = turns[turns.found.eq(True)].groupby(by, sort=False)
-
-    def held(values: pd.Series) -> float:
-        return 100.0 * float((values.dropna().abs() < Z95).mean())
-
-    def rms(values: pd.Series) -> float:
-        return float(np.sqrt(np.mean(values**2)))
-
+    m = data.groupby(by, sort=False)
     return pd.DataFrame({
-        "draws": m.size(), "RMS (σ)": m.rms.mean() ** 0.5,
-        "RMS near turns (σ)": m.near.mean() ** 0.5, "worst (σ)": m.worst.max(),
-        "held (%)": 100.0 * m.held.mean(), "held near turns (%)": 100.0 * m.held_near.mean(),
-        "height: bias (σ)": f.height.mean(), "height: RMS (σ)": f.height.apply(rms),
-        "height held (%)": f.height_z.apply(held), "instant: RMS (samples)": f.late.apply(rms),
-        "false turns (%)": 100.0 * m.invented.apply(lambda v: np.mean(v > 0)),
-        "largest reversal (σ)": m.back.max(), "modes": m.modes.median(),
-        "median time (ms)": m.ms.median(),
-    })  # fmt: skip
-
-
-def found_by_size(data: pd.DataFrame) -> pd.DataFrame:
-    """Return the share of detected inner-loop turning points, by size relative to the noise."""
-    turns = data[(data.what == "turn") & (data["class"] == "inner loop")]
-    turns = turns[turns["size"] * turns.noise < 0.3]  # larger ones are of the triangle itself
-    names = ["0 to 5", "5 to 10", "10 to 15", "15 to 20", "20 to 30", "above 30"]
-    shows = pd.cut(turns["size"] * turns.samples**0.5, [0, 5, 10, 15, 20, 30, 1e9], labels=names)
-    long = turns.samples.gt(3.0).map({True: "of 3 samples and more", False: "of fewer"})
-    seen = turns.found.astype(float)
-    counts = {"found (%)": lambda share: 100.0 * share.mean(), "turns": "size"}
-    out = seen.groupby([shows, long], observed=True).agg(**counts).unstack()
-    out.columns = [f"{kind}: {what}" for what, kind in out]
-    return out.rename_axis(index="drop (σ) × √samples")
+        "draws": m.size(), "RMS (σ)": m["mean square"].mean() ** 0.5,
+        "RMS near turns (σ)": m["near"].mean() ** 0.5, "worst (σ)": m["worst"].max(),
+        "held (%)": 100.0 * m["held"].mean(), "held near turns (%)": 100.0 * m["held near"].mean(),
+        "height held (%)": 100.0 * m["heights held"].sum() / m["heights"].sum(),
+        "false turns (%)": 100.0 * m["invented"].agg(lambda v: np.mean(v > 0)),
+        "largest reversal (σ)": m["back"].max(), "median time (ms)": m["ms"].median(),
+    }).reset_index()  # fmt: skip
 
 
 def main() -> None:
-    parser = studies.arguments(__doc__, draws=(25, "of each class, rows and noise"), seed=0)
-    options = parser.parse_args()
+    draws = (25, "of each class, rows and noise")
+    options = studies.arguments(__doc__, HERE, draws=draws).parse_args()
     cases = product(enumerate(CLASSES), ROWS, enumerate(NOISE), range(options.draws))
     data = pd.DataFrame(
-        row for (k, name), n, (i, noise), draw in cases
-        for row in one(name, n, noise, np.random.default_rng([options.seed, k, n, i, draw]))
+        {"class": name, "cell": f"{n} rows, {100.0 * noise:g} %"}
+        | one(name, n, noise, np.random.default_rng([0, k, n, i, draw]))
+        for (k, name), n, (i, noise), draw in cases
     )  # fmt: skip
-    percents = (100.0 * data.noise).round(3).astype(str)
-    data["cell"] = data.rows.astype(str) + " rows, " + percents + " %"
-    tables = {"classes": table(data, "class"), "cells": table(data, "cell")}
-    tables["found"] = found_by_size(data)
-    values = {name: studies.shown(one.astype(float).reset_index()) for name, one in tables.items()}
-    whole = options.draws >= 25 and options.seed == 0
-    with studies.workplace() as folder:
-        print(studies.write_page(
-            HERE, HERE if whole else folder, draws=options.draws * len(ROWS) * len(NOISE), **values
-        ))  # fmt: skip
+    studies.write_page(
+        HERE, options.out, draws=options.draws * len(ROWS) * len(NOISE),
+        **{by: studies.shown(table(data, by)) for by in ("class", "cell")},
+    )  # fmt: skip
 
 
 if __name__ == "__main__":
