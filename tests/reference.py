@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-from independent import HAT_A, HAT_C, SIG_A, SIG_C, STAR, bistable_row
+import independent as judge
 
 Array = NDArray[np.float64]
 
+BRANCHES = "adce"
 _QUADRATURE = np.polynomial.legendre.leggauss(24)
 
 
@@ -43,34 +44,21 @@ class BistableLaw:
     """The seven-parameter law, branch by branch."""
 
     def __init__(self, spring: Any) -> None:
-        self.k0, self.kc = float(spring.k0), float(spring.kc)
         self.eps_a, self.eps_c = float(spring.eps_a), float(spring.eps_c)
-        self.kh_plus, self.kh_minus = float(spring.kh_plus), float(spring.kh_minus)
-        points = bistable_row(spring, 1.0)
-        self.sigma_a, self.sigma_c, self.eps_star = points[SIG_A], points[SIG_C], points[STAR]
-        self.limit, self.eps_hat_c = 1.0 + self.eps_star, points[HAT_C]
+        self.points = points = judge.bistable_row(spring, 1.0)
+        self.sigma_a, self.sigma_c = points[judge.SIG_A], points[judge.SIG_C]
+        self.eps_star = points[judge.STAR]
+        self.limit, self.eps_hat_c = 1.0 + self.eps_star, points[judge.HAT_C]
         self.sigma_hat_c = self.sigma("d", self.eps_hat_c)
-        self.eps_hat_a = points[HAT_A] if np.isfinite(points[HAT_A]) else None
+        self.eps_hat_a = points[judge.HAT_A] if np.isfinite(points[judge.HAT_A]) else None
 
     def sigma(self, branch: str, eps: float) -> float:
-        if branch == "a":
-            return self.k0 * eps / (1 - eps)
-        if branch == "d":
-            return self.sigma_a + self.kh_plus * (eps - self.eps_a)
-        if branch == "c":
-            return self.kc * (eps - self.eps_star) / (1 - (eps - self.eps_star))
-        return self.sigma_c + self.kh_minus * (eps - self.eps_c)
+        return float(judge.pressed.py_func(self.points, BRANCHES.index(branch), eps)[0])
 
-    def bounds(self, branch: str) -> list[tuple[float, int, str]]:
-        """Return the ends of a branch: (strain, direction of leaving, next branch)."""
-        if branch == "a":
-            return [(self.eps_a, +1, "d")]
-        if branch == "d":
-            return [(self.eps_a, -1, "a"), (self.eps_hat_c, +1, "c")]
-        if branch == "c":
-            return [(self.eps_c, -1, "e")]
-        below = [] if self.eps_hat_a is None else [(self.eps_hat_a, -1, "a")]
-        return [(self.eps_c, +1, "c"), *below]
+    def end(self, branch: str, sense: int) -> tuple[float, str]:
+        """Return the end of a branch in a direction of the strain, and the next branch."""
+        low, high, under, over = judge.bounds.py_func(self.points, BRANCHES.index(branch))
+        return (high, BRANCHES[over]) if sense > 0 else (low, BRANCHES[under])
 
     def branch(self, flag: str, eps: float) -> str:
         if flag == "a":
@@ -124,9 +112,9 @@ class BistableLaw:
         for there in np.asarray(history, float):
             out, sense = [], 1 if there >= here else -1
             while here != there:
-                ends = [b for b in self.bounds(branch) if b[1] == sense]
-                crossed = [b for b in ends if (there - b[0]) * sense > 0.0]
-                stop, _, following = crossed[0] if crossed else (there, 0, branch)
+                stop, following = self.end(branch, sense)
+                if (there - stop) * sense <= 0.0:
+                    stop, following = there, branch
                 out.append((branch, here, stop))
                 branch, here = following, stop
             yield out

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from independent import HAT_A, HAT_C, SIG_A, SIG_C, STAR, Truth, bistable_row, follow
+from independent import HAT_A, HAT_C, SIG_A, STAR, A, C, E, Truth, bistable_row, follow, pressed
 
 Array = NDArray[np.float64]
 Terms = tuple[tuple[float, float], ...]  # pairs (g, tau in s)
@@ -65,11 +65,8 @@ class Bistable:
 
     def unloading(self, strain: float) -> float:
         """Return the stress at a strain of the unloading from branch c."""
-        if strain > self.eps_c:
-            return self.kc * (strain - self.row[STAR]) / (1.0 - strain + self.row[STAR])
-        if strain > self.row[HAT_A]:
-            return self.row[SIG_C] + self.kh_minus * (strain - self.eps_c)
-        return self.k0 * strain / (1.0 - strain)
+        branch = C if strain > self.eps_c else E if strain > self.row[HAT_A] else A
+        return float(pressed.py_func(self.row, branch, strain)[0])
 
 
 @dataclass(frozen=True)

@@ -155,7 +155,7 @@ def row_of(spring: Any, height: float) -> tuple[list[float], int]:
 
 
 @inner
-def _pressed(p: Array, branch: int, eps: float) -> tuple[float, float]:
+def pressed(p: Array, branch: int, eps: float) -> tuple[float, float]:
     """Return stress (infinite past a pole) and slope of a linear or bistable spring."""
     if branch == D:
         return p[SIG_A] + p[UP] * (eps - p[EPS_A]), p[UP]
@@ -168,7 +168,7 @@ def _pressed(p: Array, branch: int, eps: float) -> tuple[float, float]:
 
 
 @inner
-def _bounds(p: Array, branch: int) -> tuple[float, float, int, int]:
+def bounds(p: Array, branch: int) -> tuple[float, float, int, int]:
     """Return the lower and upper strain limits of a branch, and the following branches."""
     if branch == A:
         return -math.inf, p[EPS_A], A, D
@@ -254,7 +254,7 @@ def _meets(p: Array) -> tuple[float, bool]:
 def _ends(p: Array, branch: int, rank: float, most: float) -> tuple[float, float, int, int]:
     """Return the limits of a branch (stress or strain), and the branches beyond."""
     if branch < HELD:
-        return _bounds(p, branch)
+        return bounds(p, branch)
     if branch == SNAP and _remembers(p):
         return -math.inf, math.inf, SNAP, SNAP
     cross, above = _meets(p)
@@ -303,7 +303,7 @@ def fill_rates(
             if not soft[i] > 0.0:
                 return False
         else:
-            s, slope = _pressed(p, flags.branch[i], x)
+            s, slope = pressed(p, flags.branch[i], x)
             soft[i] = 1.0 / slope if slope > 0.0 else math.inf
         gain[i], held[i], fade[i] = 1.0, 0.0, 0.0
         for n in range(terms):

@@ -10,9 +10,9 @@ neither the times of the samples nor the width of a snap matter. Laws: docs/theo
 from typing import Any
 
 import numpy as np
-from mpmath import exp, findroot, inf, log, mp, mpf, ncdf, sqrt
+from mpmath import exp, findroot, inf, log, mp, mpf, ncdf
 
-from independent import Array, Truth
+from independent import Array, Truth, bistable_row
 
 DIGITS = 30
 
@@ -34,20 +34,11 @@ class _Bistable(_Linear):
     """Four branches, and a flag for a spring that has snapped."""
 
     def __init__(self, spring: Any) -> None:
-        names = ("k0", "kc", "dsigma", "eps_a", "eps_c", "kh_plus", "kh_minus")
-        k0, kc, dsigma, eps_a, eps_c, up, down = (mpf(getattr(spring, name)) for name in names)
-        self.k0, self.kc, self.up, self.down, self.snapped = k0, kc, up, down, False
-        self.eps_a, self.eps_c = eps_a, eps_c
-        self.sigma_a = k0 * eps_a / (1 - eps_a)
-        self.sigma_c = self.sigma_a + dsigma
-        self.star = eps_c - self.sigma_c / (kc + self.sigma_c)
-        shift = up * (self.star - eps_a)  # where d meets c: the larger root of a quadratic
-        half = (kc - self.sigma_a - up - shift) / 2
-        self.through = -half + sqrt(half**2 + self.sigma_a * kc + shift * kc)
-        shift = down * eps_c - self.sigma_c  # where e meets a, if it does
-        half = (k0 - down + shift) / 2
-        root = half**2 - shift * k0
-        self.back = -half + sqrt(root) if root >= 0 else -inf
+        points = map(mpf, bistable_row(spring, 1.0)[:11])
+        self.k0, self.kc, self.eps_a, self.eps_c, self.star, self.sigma_a, *rest = points
+        self.sigma_c, self.up, self.down, back, through = rest
+        self.back = self.sigma_c + self.down * (back - self.eps_c) if back > -inf else -inf
+        self.through, self.snapped = self.sigma_a + self.up * (through - self.eps_a), False
 
     def strain(self, s: Any) -> Any:
         on_c = s > self.sigma_c if self.snapped else s > self.through
