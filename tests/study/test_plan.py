@@ -174,7 +174,7 @@ def test_a_spring_that_may_not_have_snapped_is_hit_harder(monkeypatch):
     first = ff.BistableSpring(1.15e6, 6.2e6, -6.5e4, 0.246, 0.414, 1.8e5, 5.4e5)
     second = ff.BistableSpring(1.7e6, 7.9e7, -6.3e5, 0.325, 0.523, 3.7e5, 1.9e5)
     chain, rng = ff.Chain([first, second], [0.01, 0.01], 1e-3), np.random.default_rng(0)
-    test = hit(chain, 5.0, 0.94, 1e-4, (5e3, 5e-5), rng)
+    test = hit(chain, 5.0, 0.94, 4e-4, (2.5e3, 2.5e-5), rng)
     result = ff.fit(test, model="bistable+bistable", starts=4, intervals="local")
     assert ff.plan(result).advice.candidate.velocity > 1.2  # it was 0.78 m/s
 
