@@ -215,13 +215,9 @@ class Microscale:
 
 
 @cache
-def _law(spring: Any) -> BistableLaw | LinearLaw:
-    return BistableLaw(spring) if hasattr(spring, "kc") else LinearLaw(spring)
-
-
 def law(spring: Any) -> Any:
     """Return the law of any object that has the attributes of a spring."""
-    return _law(spring)
+    return BistableLaw(spring) if hasattr(spring, "kc") else LinearLaw(spring)
 
 
 # ----------------------------------------------------------------------------------- derivatives
