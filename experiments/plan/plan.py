@@ -233,11 +233,6 @@ def write_page(out: Path) -> None:
             f"within_{name}": f"{row['within 1.5 (%)']:.1f} %",
             f"broke_{name}": f"{row['broke the rig']} of {row['foams']}",
         }  # fmt: skip
-    mine = rows[(rows.springs == 1) & (rows.second == "advised") & (rows.width > 0.0)]
-    ratio = (mine.width / mine["expected width"]).where(mine["expected width"] > 0.0)
-    within = ratio.between(1.0 / 1.5, 1.5).where(ratio.notna()).groupby(mine.parameter).mean()
-    each = (f"{100.0 * x:.0f} % for `{n.removeprefix('s1_')}`" for n, x in within.items())
-    values["by_parameter"] = ", ".join(each)
     studies.write_page(HERE, out, **values)
 
 
