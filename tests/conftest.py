@@ -46,6 +46,7 @@ STRIKER = '[striker]\nmass = "1 kg"\nvelocity = "1 m/s"\n'
 HEADER = "time (ms),stress (MPa),displacement (mm)"
 os.environ["COLUMNS"] = "100"  # the same output width in every terminal
 
+posix = pytest.mark.skipif(os.name != "posix", reason="signals, permissions and shell of POSIX")
 needs_data = pytest.mark.skipif(
     not DATA.is_dir(), reason="the measurements of others are not beside this checkout"
 )

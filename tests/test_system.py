@@ -26,7 +26,7 @@ def test_a_fit_of_the_page_without_a_fork_server_is_spawned(monkeypatch, tmp_pat
 
 
 def test_no_other_module_uses_what_windows_lacks():
-    lacking = ("SIGHUP", "killpg", "add_signal_handler", "start_new_session", "os.fork(")
+    lacking = "SIGHUP killpg add_signal_handler start_new_session os.fork( .is_mount("
     root = os.path.dirname(terminal.__file__)
     for folder, _, files in os.walk(root):
         for name in files:
@@ -34,4 +34,4 @@ def test_no_other_module_uses_what_windows_lacks():
             if name.endswith(".py") and path != terminal.__file__:
                 with open(path, encoding="utf-8") as file:
                     text = file.read()
-                assert not [word for word in lacking if word in text], path
+                assert not [word for word in lacking.split() if word in text], path

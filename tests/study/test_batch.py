@@ -19,7 +19,7 @@ import pytest
 
 import fabricated
 import foamfit as ff
-from conftest import HEIGHT, Inline, run, run_refused, synthetic_impact, write_csv
+from conftest import HEIGHT, Inline, posix, run, run_refused, synthetic_impact, write_csv
 from foamfit import files
 from foamfit.cli import fit as command
 from foamfit.report.listing import Row, row_of, write_comparison, write_page
@@ -27,7 +27,6 @@ from foamfit.study import batch as module
 from foamfit.study.batch import work
 from foamfit.terminal import TerminatedError
 
-posix = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 QUICK = {"starts": 2, "intervals": "local"}  # a search from one start explores longer
 TOML = (
     f'[specimen]\nheight = "{1e3 * HEIGHT} mm"\narea = "19.635 mm^2"\n'

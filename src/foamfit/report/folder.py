@@ -214,7 +214,7 @@ def _check_replaceable(folder: Path, place: Path, of: str | None) -> None:
             f"{folder} is or contains the current directory and cannot be replaced; choose a "
             "separate folder"
         )
-    if place.is_mount():
+    if os.path.ismount(place):  # Path.is_mount is missing on Windows before Python 3.12
         raise InputError(f"{folder} is a mount point and cannot be replaced; name a folder in it")
     kinds = [name for name in FILES if _content(place / name)]
     if any(place.iterdir()) and not kinds:
