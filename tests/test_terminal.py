@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import fabricated
-from conftest import RECONSTRUCTION, run, run_refused, small_pictures, without_pictures
+from conftest import RECONSTRUCTION, posix, run, run_refused, small_pictures, without_pictures
 from foamfit import api, terminal
 from foamfit.errors import InputError
 from foamfit.terminal import ending_cleanly, printable
@@ -62,7 +62,9 @@ def test_every_command_prints_in_every_encoding(
     ):
         told = run(*args, encoding=encoding)
         assert (told.exit_code, told.stderr) == (0, ""), args
-        assert told.stdout_bytes.decode(encoding)
+        text = told.stdout_bytes.decode(encoding)
+        assert text
+        assert r"\u2212" not in text  # but "-"
     quick(monkeypatch, status="failed")
     again = ("--json", "--force", "--out", "r")
     assert run("fit", RECONSTRUCTION, *again, encoding=encoding).exit_code == 2
@@ -71,7 +73,7 @@ def test_every_command_prints_in_every_encoding(
     assert r"\u03c7.csv" in refused.stderr
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@posix
 def test_an_output_that_is_full_is_one_sentence() -> None:
     command = f"{sys.executable} -m foamfit published > /dev/full"
     done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
@@ -81,6 +83,7 @@ def test_an_output_that_is_full_is_one_sentence() -> None:
     )
 
 
+@posix
 def test_a_reader_that_has_enough_changes_no_exit_code() -> None:
     command = f'({sys.executable} -m foamfit published; echo "code $?" >&2) | true'
     done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
@@ -118,6 +121,7 @@ def test_no_control_character_of_a_name_reaches_the_terminal(
     assert printable("a\tb\nc\x1b") == "a\tb\nc\\x1b"
 
 
+@posix
 def test_a_name_that_is_no_unicode_is_written_and_printed(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,6 +7,8 @@ import re
 import signal
 import sys
 import threading
+import unicodedata
+from codecs import register_error
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import TextIOWrapper
@@ -29,10 +31,22 @@ def printable(text: str) -> str:
     return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
 
 
+def _in_ascii(error: UnicodeError) -> tuple[str, int]:
+    """Write a minus as "-", an index as a digit, and escape all else that an encoding lacks."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    lacking = error.object[error.start : error.end].replace("\N{MINUS SIGN}", "-")
+    plain = unicodedata.normalize("NFKC", lacking)
+    return plain.encode("ascii", "backslashreplace").decode(), error.end
+
+
+register_error("foamfit-in-ascii", _in_ascii)
+
+
 def show_all() -> None:
-    """Make stdout escape characters that its encoding lacks instead of failing, like stderr."""
+    """Let stdout replace characters that its encoding lacks, as cp1252 of a pipe on Windows."""
     if isinstance(sys.stdout, TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
+        sys.stdout.reconfigure(errors="foamfit-in-ascii")
 
 
 def say(text: str, *, err: bool = False, newline: bool = True) -> None:
