@@ -245,11 +245,12 @@ def test_the_error_of_the_law_grows_after_the_last_fitted_cycle():
         stress=np.asarray(ff.MicroscaleSpring(**{n[3:]: v for n, v in LAW.items()}).stress(strain)),
     )  # fmt: skip
     content = fit_content(statistics={"cycle_growth": 0.5})
-    content["data"]["last_cycle"] = 2
-    found = ff.predict(in_memory(content), four)
-    law = found.curves["stress_strain"].parts["law_error"]
-    widths = np.array([law[part].mean() for part in cycles_of(four).values()])
-    assert widths / widths[0] == pytest.approx([1.0, 1.0, 1.5**0.5, 2.0**0.5])
+    for fitted in ({"last_cycle": 2}, {"cycle": 2, "last_cycle": None}):
+        content["data"] |= fitted
+        found = ff.predict(in_memory(content), four)
+        law = found.curves["stress_strain"].parts["law_error"]
+        widths = np.array([law[part].mean() for part in cycles_of(four).values()])
+        assert widths / widths[0] == pytest.approx([1.0, 1.0, 1.5**0.5, 2.0**0.5])
 
 
 # ------------------------------------------------------------------------------- the parameters

@@ -60,7 +60,7 @@ class Source:
     together: Array
     sha256: str | None  # Of the record of a fit of one test
     smoothed: bool | None  # Whether the drive was the smoothed motion
-    # For several cycles fitted as one history: the number of the last, and `Fit.growth`.
+    # The number of the last fitted cycle, and `Fit.growth` of several fitted as one history.
     last_cycle: float | None
     growth: float
 
@@ -141,7 +141,7 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
         together=together,
         sha256=content.get("data_sha256"),
         smoothed=next((curve.get("motion_smoothed") for curve in noise.values()), None),
-        last_cycle=data.get("last_cycle"),
+        last_cycle=data.get("last_cycle") or data.get("cycle"),
         growth=(content.get("statistics") or {}).get("cycle_growth") or 0.0,
     )
 
