@@ -346,7 +346,7 @@ class Fit(OfLaw):
 
     @property
     def at_noise(self) -> bool | None:
-        """Whether the residuals are at the estimated noise; None if unknown."""
+        """Whether the residuals are at the noise level; None if unknown."""
         return next((check.answer for check in self.checklist if check.key == "noise"), None)
 
     @property

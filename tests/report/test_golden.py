@@ -45,7 +45,7 @@ def with_rows(result: Fit) -> Fit:
 
 def one_spring() -> Fit:
     weak = "Not determined: s1_kh_minus (branch e was never reached)."
-    floor = "The residuals of stress_time are 1.6 times the stated noise."
+    floor = "The residuals of stress-time are 1.6 times the stated noise."
     return with_rows(
         fabricated.result(
             warnings=(floor, weak),
@@ -53,7 +53,7 @@ def one_spring() -> Fit:
                 Check("followed", "Does the model follow the curves?", True, "1.2 % and 0.4 %."),
                 Check(
                     "noise",
-                    "Are the residuals at the estimated noise?",
+                    "Are the residuals at the noise level?",
                     False,
                     "1.60 and 1.02.",
                     (floor,),

@@ -202,7 +202,9 @@ def cut_to_contact(record: Record, start: contact.Start, span: zeros.Span) -> Re
     cut = cut if span.end - start.first < n else ""
     record = record.noted(f"Contact starts {start.how}{at}{cut}.")
     if not span.returned:
-        record = record.noted("Check: the record ends before the stress has returned to zero.")
+        record = record.noted(
+            "Check: the record ends before the stress has returned to zero, or its zero drifts."
+        )
     if record.time is not None:
         record = record.shifted("time", start.time)
     return record.between(span.first, span.end, "before contact starts", "after contact ends")

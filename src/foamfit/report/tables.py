@@ -33,7 +33,7 @@ _TEXT |= {"–": "--", "…": r"\dots{}"} | {letter: f"${letter}$" for letter in
 _TEXT |= {letter: f"{{{letter}}}" for letter in "[]*"}  # options at the start of a row
 _LAST_LETTER = "ſ"  # last letter that pdfLaTeX sets without further packages
 # Names of the misfits in a table with one row per test.
-MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "u(t)"}
+MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "w(t)"}
 Parameters = Mapping[str, ParameterEstimate]
 ByTest = Mapping[str, Sequence[ParameterEstimate | None]]
 

@@ -337,7 +337,8 @@ def state(
         return "not determined", f"its {what} is {wide} {of}"
     for limit in limits:
         if abs(value - limit) <= AT_LIMIT * size:
-            return "weak", f"it lies at its limit {limit:g}; its interval is open on that side"
+            at = "it lies at its limit" if limit else "it lies at its limit 0"
+            return "weak", f"{at}; its interval is open on that side"
     width = f"its {what} is ±{percent(ratio)} of {of}"
     far = half if what == "range" else max(high - value, value - low)
     if half <= WEAK * size < far:  # another minimum lies to one side
