@@ -84,8 +84,10 @@ def readable(name: str, p: ParameterEstimate, given: tuple[float, str] | None = 
         shown, stderr, places = _rounded(value, p.stderr / factor)
         if p.ci95 is not None:
             interval = " to ".join(_fixed(bound / factor, places) for bound in p.ci95)
-    if p.range is not None:  # two digits suffice
-        ends = (float(f"{bound / factor + 0.0:.2g}") for bound in p.range)
+    if p.range is not None:  # two digits suffice, of the difference in a narrow range
+        size, width = max(map(abs, p.range)), p.range[1] - p.range[0]
+        digits = 2 + (math.floor(math.log10(size / width)) if 0.0 < 10.0 * width < size else 0)
+        ends = (float(f"{bound / factor + 0.0:.{digits}g}") for bound in p.range)
         span = " to ".join(f"{end:g}".replace("-", "−") for end in ends)
     unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
     scale = f"{p.systematic / factor:.2g}" if p.systematic else ""
