@@ -1,8 +1,8 @@
 """Processes as Windows starts them, tried here; for the end of the page see serving.py."""
 
 import multiprocessing
-import os
 import time
+from pathlib import Path
 
 from foamfit import terminal
 from foamfit.page import worker
@@ -27,11 +27,7 @@ def test_a_fit_of_the_page_without_a_fork_server_is_spawned(monkeypatch, tmp_pat
 
 def test_no_other_module_uses_what_windows_lacks():
     lacking = "SIGHUP killpg add_signal_handler start_new_session os.fork( .is_mount("
-    root = os.path.dirname(terminal.__file__)
-    for folder, _, files in os.walk(root):
-        for name in files:
-            path = os.path.join(folder, name)
-            if name.endswith(".py") and path != terminal.__file__:
-                with open(path, encoding="utf-8") as file:
-                    text = file.read()
-                assert not [word for word in lacking.split() if word in text], path
+    for path in Path(terminal.__file__).parent.rglob("*.py"):
+        if path != Path(terminal.__file__):
+            text = path.read_text(encoding="utf-8")
+            assert not [word for word in lacking.split() if word in text], path
