@@ -226,7 +226,8 @@ def _draws(
 
     noise = float(np.max(np.diag(known.meat[0]) / np.maximum(np.diag(known.bread[0]), 1e-300)))
     noise, marks, steps = max(noise, 1.0), list[float](), list[tuple[Array, Array]]()
-    for one in every:
+    costs = [cost(one, one.vectors[0]) for one in every]
+    for one, least in zip(every, costs, strict=True):
         inverse = np.linalg.inv(one.bread + prior)
         spread = inverse @ (one.meat + prior) @ inverse + allowed / 1.96**2 * inverse
         power, axes = np.linalg.eigh(spread)
@@ -235,9 +236,8 @@ def _draws(
         slopes = space.slopes(best, one.vectors[0])[at] / known.sizes[:, None]
         steps.append((best, np.linalg.lstsq(slopes, axes, rcond=1e-12)[0]))
         volume = np.linalg.slogdet(np.eye(best.size) + slopes.T @ one.bread @ slopes)[1]
-        marks.append(-0.5 * (cost(one, one.vectors[0]) / noise + volume))
-    least = min(cost(one, one.vectors[0]) for one in every)
-    most = least + allowed + noise * float(stats.chi2.ppf(0.99, k))
+        marks.append(-0.5 * (least / noise + volume))
+    most = min(costs) + allowed + noise * float(stats.chi2.ppf(0.99, k))
     weights, out = _weights(every, np.array(marks)), list[Explanation]()
     for _ in range(count):
         chosen = int(rng.choice(len(every), p=weights)) if len(every) > 1 else 0

@@ -71,6 +71,11 @@ class Known:
         """Scale of each parameter in each draw over `sizes`, (d, k)."""
         return np.array([self.problem.sizes(self.names, one) for one in self.draws]) / self.sizes
 
+    @property
+    def places(self) -> list[int]:
+        """Places of the parameters in a vector of all."""
+        return [self.problem.index[name] for name in self.names]
+
     def with_springs(self, drawn: Array, problem: Problem) -> Array:
         """Return the parameters of another test: drawn springs, and its nuisance parameters."""
         count = len(self.problem.model.names)
@@ -109,6 +114,12 @@ def without_nuisance(rows: Array, k: int) -> Array:
     """Return the last k columns without their part along the others (Frisch & Waugh 1933)."""
     others = np.linalg.qr(rows[:, :-k])[0]
     return np.asarray(rows[:, -k:] - others @ (others.T @ rows[:, -k:]))
+
+
+def roots_of(problem: Problem, weight: float) -> Array:
+    """Return the factors of residuals whose samples have some weight; priors have none."""
+    objective = problem.objective
+    return np.repeat([weight**0.5, 1.0], [objective.n_data, len(objective.priors)])
 
 
 def information(rows: Array, root: Array) -> tuple[Array, Array]:
@@ -168,10 +179,9 @@ def look(
     problem = problem_for(known, candidate, rig)
     objective, test = problem.objective, known.problem.measurement
     each, counted = candidate.weight(objective.time, test, rig), objective.counted
-    weigh, noise = np.ones((2, objective.n_data + len(objective.priors)))
-    weigh[: objective.n_data] = math.sqrt(each)
+    weigh = roots_of(problem, each)
     own = [objective.noise(c).sigma * objective.factor(c) for c in counted]
-    noise[:] = np.append(np.repeat(own, objective.sizes), [objective.unit] * len(objective.priors))
+    noise = np.repeat([*own, objective.unit], [*objective.sizes, len(objective.priors)])
     k, d = len(known.names), len(known.draws)
     bread, meat = np.zeros((2, d, k, k))
     reached, broken = np.zeros((d, k), dtype=bool), np.ones(d, dtype=bool)
@@ -187,9 +197,8 @@ def look(
             continue
         forces.append(float(shown.motion.base_stress.max()) * test.specimen.area)
         most = float(shown.motion.displacement[-1].max())
-        strain = most / test.specimen.height
-        within = forces[-1] <= rig.force and most <= rig.displacement
-        broken[i] = not (within and strain <= rig.largest_strain)
+        limits = rig.force, rig.displacement, rig.largest_strain
+        broken[i] = np.any(np.array([forces[-1], most, most / test.specimen.height]) > limits)
         if broken[i]:  # no record
             continue
         rows = rows_of(problem, values, known.names, known.sizes) * weigh[:, None]
@@ -266,15 +275,14 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
     """
     noise, law = (np.diagonal(one, axis1=1, axis2=2) for one in covariance(known, seen))
     halves, ranges = (np.sqrt(np.maximum(one, 0.0)) for one in (NORMAL**2 * noise, law))
-    wider, places = np.maximum(halves, ranges), [known.problem.index[n] for n in known.names]
-    values, wide = known.draws[:, places] / known.sizes, wider / known.drawn_sizes
+    wider, values = np.maximum(halves, ranges), known.draws[:, known.places] / known.sizes
     clear, limits = np.abs(values) > wider, [known.problem.params[n] for n in known.names]
     least, most = np.array([(one.min, one.max) for one in limits]).T / known.sizes
     # As in a fit, an interval ends at the limits of its parameter.
     low, high, elsewhere = _with_others(known, seen, values, halves)
     widths = np.minimum(high, most) - np.maximum(low, least)
     shares = 0.5 * (high - low) / known.drawn_sizes
-    wide = np.maximum(wide, shares)  # and, to one side, another minimum
+    wide = np.maximum(wider / known.drawn_sizes, shares)  # and, to one side, another minimum
     side = np.maximum(wide, np.maximum(high - values, values - low) / known.drawn_sizes)
     reached = np.broadcast_to(known.reached, halves.shape)
     for one in seen:
@@ -321,15 +329,6 @@ def _with_others(
                 apart = np.maximum(low[i] - other.values, other.values - high[i])
                 elsewhere[i] |= apart > FAR * (high[i] - low[i])
     return low, high, elsewhere
-
-
-def no_worse(found: dict[str, Expected], now: dict[str, Expected]) -> dict[str, Expected]:
-    """Return what is expected after further tests, which take nothing away.
-
-    The draws may lie where less is determined than at the best point.
-    """
-    kept = {name for name, one in found.items() if now[name].state == "determined" != one.state}
-    return found | {name: now[name] for name in kept}
 
 
 @dataclass(frozen=True, eq=False)

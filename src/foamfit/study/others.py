@@ -25,8 +25,9 @@ from foamfit.fitting.minima import in_order
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Layout
 from foamfit.springs.model import exchanges
+from foamfit.study import gain
 from foamfit.study.draws import Test
-from foamfit.study.gain import Known, Refit, Seen, problem_for, rows_of, without_nuisance
+from foamfit.study.gain import Known, Refit, Seen, problem_for
 from foamfit.trust.covariance import NOTHING, WEAK
 
 MOST, STEPS = 8, 10  # number of other springs that are fitted to a drawn foam, and of their steps
@@ -52,9 +53,9 @@ class Other:
         objective, values = problem.objective, known.with_springs(self.values, problem)
         shown = objective.simulate(values, everything=True)
         apart = objective.compare(shown, values) - residual
-        rows = np.column_stack((rows_of(problem, values, known.names, known.sizes), apart))
-        rows *= _roots(problem, weight)[:, None]
-        rows, never = without_nuisance(rows, len(known.names) + 1), unreached(problem, shown)
+        rows = np.column_stack((gain.rows_of(problem, values, known.names, known.sizes), apart))
+        rows *= gain.roots_of(problem, weight)[:, None]
+        rows, never = gain.without_nuisance(rows, len(known.names) + 1), unreached(problem, shown)
         reached = self.reached | np.array([name not in never for name in known.names])
         return replace(self, inner=self.inner + rows.T @ rows, reached=reached)
 
@@ -62,18 +63,8 @@ class Other:
         """Return the springs fitted to the tests, to first order."""
         bread, gradient = self.inner[:-1, :-1], self.inner[:-1, -1]
         step = np.linalg.solve(bread + np.diag((NOTHING * self.scale) ** -2.0), gradient)
-        values = self.values[_places(known)] / known.sizes - step
+        values = self.values[known.places] / known.sizes - step
         return Refit(values, max(self.inner[-1, -1] - float(gradient @ step), 0.0), self.reached)
-
-
-def _roots(problem: Problem, weight: float) -> Array:
-    """Return the factors of residuals whose samples have some weight; priors have none."""
-    objective = problem.objective
-    return np.repeat([weight**0.5, 1.0], [objective.n_data, len(objective.priors)])
-
-
-def _places(known: Known) -> list[int]:
-    return [known.problem.index[name] for name in known.names]
 
 
 def others_of(
@@ -112,7 +103,7 @@ def _sought(
     """
     layout = Layout.of(tuple(problems), Links(dict.fromkeys(known.names, "shared")))
     weights = [*[1.0] * (len(problems) - 1), weight]
-    weigh = np.concatenate(list(map(_roots, problems, weights)))
+    weigh = np.concatenate(list(map(gain.roots_of, problems, weights)))
     begin = layout.start(drawn)
     target, count = layout.residual(begin), len(known.problem.model.names)
 
@@ -135,7 +126,7 @@ def _sought(
         for _, i in sorted(left)[:MOST]
     ]
     out, covered = list[Array](), np.zeros(len(known.names), dtype=bool)
-    first, places = problems[0], _places(known)
+    first, places = problems[0], known.places
     for end in sorted(ends, key=lambda one: one.cost):
         values = layout.terms[0].values(end.point)
         found = in_order(first.space(), first.objective, values)[:count]

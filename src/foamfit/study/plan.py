@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import make_params, make_problem
 from foamfit.one_model import Progress
 from foamfit.parts import rung_name
-from foamfit.report.studies.plan import RISKY, Expected, Outcome, Plan, Quantity
+from foamfit.report.studies.plan import Expected, Outcome, Plan, Quantity
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.published import published
@@ -92,45 +92,24 @@ def plan(
     rng, test = np.random.default_rng(seed), tests[0].problem.measurement
     limits, asked = _candidates(tests[0], rivals, rig)
     progress(0.0, "drawing what the tests leave open")
-    several = tests[0].problem.model.has_several
-    known = known_of(tests, rng, FEWER_DRAWS if several else DRAWS)
+    known = known_of(tests, rng, FEWER_DRAWS if tests[0].problem.model.has_several else DRAWS)
     others = {name: known_of([one], rng, 0) for name, one in rivals.items()}
     target = None if quantity is None else gain.Target.of(quantity, known, limits)
-
-    def look(i: int, one: Candidate) -> Seen:
-        progress(0.05 + 0.65 * i / len(asked), f"{counted(len(asked), 'candidate')}, {i} done")
-        return gain.look(known, one, limits, others)
-
-    now = _now(known, tests)
     contradicted = known.missed > 0.0 and any(x.fit and x.fit.contradictions for x in tests)
-
-    def outcome(one: Candidate, *more: Seen) -> Outcome:
-        risk = np.any([each.broken for each in more], axis=0)
-        error = None if target is None else target.error(known, more)
-        found = gain.no_worse(gain.expected(known, more), now)
-        if contradicted and one.drive == "impact":  # as in a fit, where the law errs as well
-            found = {name: x.capped() for name, x in found.items()}
-        return Outcome(one, float(np.mean(risk)), found, more[0].force, error, more[0].apart)
-
-    def judged(seen: Sequence[Seen]) -> tuple[list[Outcome], list[int], int | None]:
-        outcomes = list(map(outcome, asked, seen))
-        safe = [i for i, one in enumerate(outcomes) if one.breaks <= RISKY]
-        known_now = sum(one.probability for one in now.values())
-        return outcomes, safe, _advised(outcomes, safe, known_now) if safe else None
-
-    seen = list(map(look, range(len(asked)), asked))
-    outcomes, safe, best = judged(seen)
+    judge = _Judge(known, _now(known, tests), target, contradicted)
+    seen = list[Seen]()
+    for i, one in enumerate(asked):
+        progress(0.05 + 0.65 * i / len(asked), f"{counted(len(asked), 'candidate')}, {i} done")
+        seen.append(gain.look(known, one, limits, others))
+    outcomes, safe, best = judge.of(asked, seen)
     if best is not None and known.explained is not None:
         progress(0.7, "other springs that would show the same")
         each = others_of(known, tests, asked[best], limits)
         seen = [with_others(known, each, *x, limits) for x in zip(asked, seen, strict=True)]
-        outcomes, safe, best = judged(seen)
-    pair = _pair(known, outcomes, seen, safe)
+        outcomes, safe, best = judge.of(asked, seen)
     progress(0.92, "what no test of this rig determines")
-    shown = [now, *(outcomes[i].expected for i in safe)]
-    sure = {name for each in shown for name, one in each.items() if one.state == "determined"}
-    left = [name for name in known.names if name not in sure]
-    never = _beyond(known, left, limits, impacts=not contradicted)
+    shown = [judge.now, *(outcomes[i].expected for i in safe)]
+    never = _beyond(known, shown, limits, impacts=not contradicted)
     progress(0.97, "the velocity that closes the loop")
     return Plan(
         name=tests[0].study or test.name,
@@ -138,10 +117,10 @@ def plan(
         model=known.problem.model.name,
         relaxation=known.problem.model.relaxation,
         rig=limits,
-        now=now,
+        now=judge.now,
         outcomes=tuple(outcomes),
         advice=None if best is None else outcomes[best],
-        pair=pair and (outcome(asked[pair[0]], *(seen[i] for i in pair)), asked[pair[1]]),
+        pair=judge.pair(outcomes, seen, safe),
         never=never,
         closing={mass: _closing(known, mass, limits) for mass in limits.masses},
         quantity=None
@@ -255,6 +234,44 @@ def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
 # ------------------------------------------------------------------ the advice
 
 
+@dataclass(frozen=True, eq=False)
+class _Judge:
+    """What the tests at hand say, by which candidates are judged."""
+
+    known: Known
+    now: dict[str, Expected]
+    target: gain.Target | None
+    contradicted: bool  # whether some record contradicts itself where the law errs as well
+
+    def outcome(self, one: Candidate, *seen: Seen) -> Outcome:
+        """Return what a candidate would determine, together with others of which more is seen."""
+        risk = np.any([each.broken for each in seen], axis=0)
+        error = None if self.target is None else self.target.error(self.known, seen)
+        found = gain.expected(self.known, seen)
+        if self.contradicted and one.drive == "impact":  # as in a fit
+            found = {name: x.capped() for name, x in found.items()}
+        return Outcome(one, float(np.mean(risk)), found, seen[0].force, error, seen[0].apart)
+
+    def of(
+        self, asked: Sequence[Candidate], seen: Sequence[Seen]
+    ) -> tuple[list[Outcome], list[int], int | None]:
+        """Return the outcomes of candidates, and the places of the safe ones and the best one."""
+        outcomes = list(map(self.outcome, asked, seen))
+        safe = [i for i, one in enumerate(outcomes) if not one.risky]
+        now = sum(one.probability for one in self.now.values())
+        return outcomes, safe, _advised(outcomes, safe, now) if safe else None
+
+    def pair(
+        self, outcomes: Sequence[Outcome], seen: Sequence[Seen], safe: Sequence[int]
+    ) -> tuple[Outcome, Candidate] | None:
+        """Return what the two safe tests would determine that determine most, and the second."""
+        first = sorted(safe, key=lambda i: -outcomes[i].number)[:PAIRED]
+        asked = [one.candidate for one in outcomes]
+        both = combinations(first, 2)
+        made = [(self.outcome(asked[i], seen[i], seen[j]), asked[j]) for i, j in both]
+        return max(made, key=lambda one: one[0].number, default=None)
+
+
 def _advised(outcomes: Sequence[Outcome], safe: Sequence[int], now: float) -> int:
     """Return the place of the advised test among those that are `safe`.
 
@@ -284,21 +301,12 @@ def _advised(outcomes: Sequence[Outcome], safe: Sequence[int], now: float) -> in
     return min((i for i in near if outcomes[i].narrowness <= least + WIDER), key=effort)
 
 
-def _pair(
-    known: Known, outcomes: Sequence[Outcome], seen: Sequence[Seen], safe: Sequence[int]
-) -> tuple[int, int] | None:
-    """Return the places of the two safe tests that determine most together."""
-    first = sorted(safe, key=lambda i: -outcomes[i].number)[:PAIRED]
-
-    def number(pair: tuple[int, int]) -> float:
-        found = gain.expected(known, [seen[i] for i in pair])
-        return sum(one.probability for one in found.values())
-
-    return max(combinations(first, 2), key=number, default=None)
-
-
-def _beyond(known: Known, left: Sequence[str], rig: Rig, *, impacts: bool) -> dict[str, str]:
-    """Return, for parameters that no test of the rig determines, what other rig would."""
+def _beyond(
+    known: Known, shown: Sequence[dict[str, Expected]], rig: Rig, *, impacts: bool
+) -> dict[str, str]:
+    """Return, for parameters that are never determined in `shown`, what other rig would."""
+    sure = {name for each in shown for name, one in each.items() if one.state == "determined"}
+    left = [name for name in known.names if name not in sure]
     problem, out = known.problem, dict.fromkeys(left, "")
     test, springs = problem.measurement, len(problem.model.kinds)
     few: dict[str, Any] = {n: getattr(known, n) for n in ("draws", "bread", "meat", "reached")}
