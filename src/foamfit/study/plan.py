@@ -42,9 +42,10 @@ from foamfit.text import counted
 DRAWS = 40  # number of drawn foams
 FEWER_DRAWS = 16  # the same for springs in series, each of which is fitted in other ways
 NEARLY = 0.1  # tests that determine this many parameters fewer, on average, count as equal
-# What a softer test may lose: parameters, on average, and this share of the width of intervals. A
-# faster one is also more likely to break the rig: with 0.1, fewer parameters were determined.
-FEWER, WIDER = 0.5, 0.05
+# What a softer test may lose: parameters, on average, but only a PART of those that the best one
+# adds, and this share of the width of intervals. A faster one is also more likely to break the rig:
+# with 0.1, fewer parameters were determined.
+FEWER, PART, WIDER = 0.5, 0.25, 0.05
 PAIRED = 20  # number of tests whose pairs are compared
 TOLD_APART = 9.0  # rise of χ² at which a test tells two laws apart
 # The closing velocity is sought at SPEEDS down to a SLOWEST part of the largest; then its interval
@@ -296,7 +297,8 @@ def _advised(outcomes: Sequence[Outcome], safe: Sequence[int], now: float) -> in
         return min(told, key=lambda i: outcomes[i].error or 0.0)
     if most <= now + NEARLY:
         return min(told, key=lambda i: outcomes[i].narrowness)
-    near = [i for i in safe if outcomes[i].number >= most - FEWER and least_apart(i) >= TOLD_APART]
+    enough = most - min(FEWER, PART * (most - now))
+    near = [i for i in safe if outcomes[i].number >= enough and least_apart(i) >= TOLD_APART]
     least = min(outcomes[i].narrowness for i in near)
     return min((i for i in near if outcomes[i].narrowness <= least + WIDER), key=effort)
 
