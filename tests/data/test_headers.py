@@ -84,10 +84,18 @@ def test_rows_without_a_force_and_a_motion_are_counted(
     assert (item.rows, item.why) == (unused, "no numbers in the columns in use")
 
 
-def test_a_result_below_the_table_is_a_remark(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("below", "why"),
+    [
+        (["Max force,200,N"], "a remark below the table"),
+        (["Mean,100,2", "", "Std. Dev.,1,1"], "statistics below the table"),
+        (["15,100,2,mean", "max,30,200,4"], "statistics below the table"),  # with a column more
+    ],
+)
+def test_results_below_the_table_are_no_samples(tmp_path: Path, below: list[str], why: str) -> None:
     rows = [f"{t},\u2212{f},\u2212{w}" for t, f, w in zip(T, F, W, strict=True)]  # minus signs
-    (item,) = read_test(write_lines(tmp_path, [PLAIN, *rows, "Max force,200,N"])).rows.dropped
-    assert (item.rows, item.first, item.why) == (1, T.size + 2, "a remark below the table")
+    (item,) = read_test(write_lines(tmp_path, [PLAIN, *rows, *below])).rows.dropped
+    assert (item.rows, item.first, item.why) == (len([*filter(None, below)]), T.size + 2, why)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +105,6 @@ def test_a_result_below_the_table_is_a_remark(tmp_path: Path) -> None:
         (["N/A,N/A,1", *ROWS[1:]], "row 2, column 'time (s)' is 'N/A'"),
         ([*ROWS[:30], "here,the,force", *ROWS[30:]], "row 32, column 'time (s)' is 'here'"),
         ([*ROWS[:30], "Max force,200,N", *ROWS[30:]], "row 32, column 'time (s)' is 'Max force'"),
-        ([*ROWS, "max,200,4"], "row 203, column 'time (s)' is 'max'"),
         ([f"{t},NaN,{w}" for t, w in zip(T, W, strict=True)], "row 2, column 'force (N)' is 'NaN'"),
         ([f"{t},{f},n/a" for t, f in zip(T, F, strict=True)], "row 2, column 'displacement (mm)'"),
         (ROWS[:1], "fewer than 10 rows"),

@@ -22,7 +22,7 @@ from foamfit.data.measurement import MIN_ROWS, Dropped, Window
 from foamfit.data.noise import integrated_twice, noise_level
 from foamfit.data.outliers import fresh_samples, inner_samples
 from foamfit.data.tables.columns import SOURCES, Source
-from foamfit.data.tables.csv_table import read_numbers, without_cut_row
+from foamfit.data.tables.csv_table import read_numbers
 from foamfit.data.units import LARGEST
 from foamfit.errors import InputError
 
@@ -67,7 +67,7 @@ class Channels:
 
 def read_channels(source: Source, duplicates: str, delay: float = 0.0) -> Channels:
     """Read the channels of a table; for `duplicates` see `toml_file`."""
-    table, cut = without_cut_row(source.table)
+    table = source.table
     factors = {channel: source.factor(channel) for channel in source.columns}
     numbers, rows, dropped = read_numbers(table, source.columns)
     if rows.size < MIN_ROWS:
@@ -89,7 +89,7 @@ def read_channels(source: Source, duplicates: str, delay: float = 0.0) -> Channe
         if match and (said := int(match[1])) != rows.size:
             notes.append(f"Check: row {row} announces {said} samples, the table has {rows.size}.")
             break
-    dropped = [*cut, *dropped]
+    dropped = [*table.dropped, *dropped]
     if "time" in numbers:
         if duplicates == "average":
             numbers, rows = _averaged(numbers, rows, dropped, notes)

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from foamfit.data.measurement import Entry, Striker, interior_channel, interior_node
-from foamfit.data.tables.csv_table import Table, Text, find_table, read_numbers
+from foamfit.data.tables.csv_table import Table, Text, find_table, read_numbers, without_foot
 from foamfit.data.tables.headers import CHANNELS, WEAK, WEIGHTS, channel_of, example, in_si
 from foamfit.data.toml_file import Settings
 from foamfit.data.units import is_unit
@@ -42,7 +42,7 @@ class Source:
         raises InputError, and for a table without headers, unless it is given numbers of columns.
         """
         names = {column.column for column in given.values()}
-        table = find_table(text, names if unclear is None else {*names, 1})
+        table = without_foot(find_table(text, names if unclear is None else {*names, 1}))
         return cls(table, _assigned(table, given, unclear), given, section)
 
     def factor(self, channel: str) -> float:

@@ -30,10 +30,16 @@ _ABOVE = 40  # number of rows compared with the last row
 _NUMBER = re.compile(
     r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?)", re.IGNORECASE | re.ASCII
 )
+# Names of statistics below a table, without blanks and points.
+_STATISTICS = re.compile(
+    "mean|average|avg|mittelwert|median|st(andar)?d(d?ev(iation)?)?|sd|standardabweichung|stabw|cv|"
+    "sem|var(iance|ianz)?|min(imum)?|max(imum)?|range|count|n|sum|summe|25%|50%|75%"
+)
+_STATISTICS_ROWS = 12  # most of these
 _MISSING = ("", "nan", "na", "n/a", "#n/a")  # what programs write for a missing number
 # A time of day such as 12:00:00.5 or 3:00:00.5 PM, with or without a date before it.
 _OF_DAY = re.compile(
-    r"(?:[\d./-]+[T ]+)?(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,]\d+)?)(?: ?([ap])m)?",
+    r"(?:[\d./-]+[T ]+)?(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,]\d+)?)(?: ?([ap])m|Z)?",
     re.IGNORECASE | re.ASCII,
 )
 DAY = 86400.0  # s
@@ -56,7 +62,8 @@ class Text:
 class Table(Text):
     """Layout of the table in a file, before its numbers are read.
 
-    `header_row` is 0 in a file without headers. For `clock` see `layouts.Scope`.
+    `header_row` is 0 in a file without headers. For `clock` see `layouts.Scope`; rows `dropped`
+    from the end are not in `content`.
     """
 
     separator: str
@@ -66,6 +73,7 @@ class Table(Text):
     first_row: int  # rows above the numbers
     headers: tuple[Header, ...]
     clock: tuple[float, float] | None = None
+    dropped: tuple[Dropped, ...] = ()
 
     @property
     def listed(self) -> str:
@@ -106,12 +114,22 @@ def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
             wide = next((w for start, w in _WIDE.items() if re.match(start, raw, re.DOTALL)), "")
             text = raw[: len(raw) // 2 * 2].decode(wide) if wide else raw.decode("utf-8-sig")
         except UnicodeDecodeError:
-            text = raw.removeprefix(codecs.BOM_UTF8).decode("latin-1")
+            text = _of_code_page(raw.removeprefix(codecs.BOM_UTF8))
         text = text.lstrip("\ufeff")  # a converted file may have several byte order marks
         text = re.sub(r"\u2212(?=[\d.,])", "-", text) if "\u2212" in text else text
         if "\0" in text:
             raise InputError("is a binary file; it must be a text table (CSV) or .xlsx.")
     return Text(path, re.sub(r"\r*\n|\r", "\n", text) if "\r" in text else text, sha256)
+
+
+def _of_code_page(raw: bytes) -> str:
+    """Decode Latin-1, or Shift-JIS or Windows-1252 if Latin-1 has control characters instead."""
+    text = raw.decode("latin-1")
+    if not re.search(r"[\x80-\x9f]", text):
+        return text
+    japanese = raw.decode("cp932", "replace")
+    words = "\ufffd" not in japanese and re.search(r"[\u3040-\u30ff\u4e00-\u9fff]{2}", japanese)
+    return japanese if words else raw.decode("cp1252", "replace")
 
 
 def find_table(text: Text, names: set[str | int]) -> Table:
@@ -407,15 +425,22 @@ def _refuse_thousands(table: Table, column: int, values: Array) -> None:
         raise InputError(f"column {table.name(column)}: {wrong}; {_NO_THOUSANDS}.")
 
 
-def without_cut_row(table: Table) -> tuple[Table, list[Dropped]]:
-    """Drop an incomplete last row, as left when writing was interrupted.
+def without_foot(table: Table) -> Table:
+    """Drop statistics below the table, and an incomplete last row.
 
-    Such a row has no line end. It has fewer cells than the rows above, or its last number ends in
-    the decimal sign, or has fewer decimals while the `_ABOVE` rows above all have the same number.
+    Such a row is left when writing was interrupted. It has no line end. It has fewer cells than the
+    rows above, or its last number ends in the decimal sign, or has fewer decimals while the
+    `_ABOVE` rows above all have the same number.
     """
+    rows, foot = table.content.rstrip().split("\n"), list[int]()
+    while len(rows) > table.first_row and _is_statistic(table, rows[-1]):
+        foot += [len(rows)] * bool(rows.pop().strip())
+    if 0 < len(foot) <= _STATISTICS_ROWS:  # more are a column of words
+        dropped = Dropped.of(np.array(foot[::-1]), "statistics below the table")
+        return replace(table, content="\n".join(rows), dropped=(dropped,))
     above = table.body().rsplit("\n", _ABOVE)[1:]
     if len(above) < MIN_ROWS or not above[-1].strip() or '"' in above[-1]:
-        return table, []
+        return table
     *whole, last = ([c.strip() for c in line.split(table.separator)] for line in above)
     (_, sign, end), *ends = (cells[-1].partition(table.decimal) for cells in (last, *whole))
     digits, counts = {len(digits) for *_, digits in ends}, {len(cells) for cells in whole}
@@ -423,10 +448,18 @@ def without_cut_row(table: Table) -> tuple[Table, list[Dropped]]:
     fewer = len(above) == _ABOVE and len(digits) == 1 and len(end) < min(digits)
     cut = len(counts) == 1 and (point or fewer or len(last) < min(counts))
     if not cut or not all(map(_is_number, last)):
-        return table, []
+        return table
     row, why = table.content.count("\n") + 1, f"the file ends within it, at {last[-1]!r}"
-    shorter = replace(table, content=table.content.removesuffix(above[-1]))
-    return shorter, [Dropped(1, row, row, why)]
+    shorter = table.content.removesuffix(above[-1])
+    return replace(table, content=shorter, dropped=(Dropped(1, row, row, why),))
+
+
+def _is_statistic(table: Table, line: str) -> bool:
+    """Return whether a row is blank, or contains the name of a statistic and numbers only."""
+    cells = [cell for _, row in _cells([line], table.separator) for cell in map(str.strip, row)]
+    words = [cell for cell in filter(None, cells) if not _is_number(cell)]
+    bare = re.sub(r"[^\w%]", "", "".join(words).casefold())
+    return not any(cells) or (len(words) == 1 and _STATISTICS.fullmatch(bare) is not None)
 
 
 def _wrong(cell: str, decimal: str) -> str:
