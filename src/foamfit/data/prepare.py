@@ -92,11 +92,11 @@ def condition(
         end = len(first) if used.place else used.end - used.first
         span = zeros.Span(start.first, end, start.resting, end)
     record = zeros.take_zeros(record, first, start, span, levels, impact=impact)
-    rise = first_rise(record.rows(slice(len(first))), start, levels)
     if used.place:  # a later cycle has its own contact
         record = cycles.cut_to_reload(record, found, used, specimen.height)
         rise = first_rise(record, contact.Start("", 0.0, 0), levels)
     else:
+        rise = first_rise(record.rows(slice(len(first))), start, levels)
         record = cycles.zero_between(record, found, used)
         record = cycles.cut_to_cycle(record, found, chosen) if chosen else record
         record = cut_to_contact(record, start, span)
@@ -113,24 +113,17 @@ def condition(
     if is_velocity(whole) and (impact or "stress" in whole.derived):  # else it shows its noise
         velocity = whole.curves("velocity")["velocity"]
         noise["displacement"] = noise_of_integral(whole.instants, velocity)
+    # Without time a rise counts samples from the first row kept, each of which is `block` rows.
+    zero = 0.0 if used.place else whole.origins.get("contact_time", float(span.first))
+    size = block if whole.time is None else 1
     test = _measured(
         whole, record, block, excess, specimen=specimen, striker=striker and given, flight=flight,
         noise=replace(_stated_of_blocks(stated, levels, whole, block), estimated=noise),
         contact="stress" if used.place else start.by, cycle=used.number, last_cycle=used.last,
         cycles=tuple(cycle.number for cycle in found) or (1,),
-        rise=rise and _on_clock(rise, whole, block, 0 if used.place else span.first),
+        rise=rise and ((rise[0] - zero - 0.5 * (size - 1)) / size, rise[1] / size),
     )  # fmt: skip
     return with_gravity(test) if impact else test
-
-
-def _on_clock(rise: contact.Kink, record: Record, block: int, first: int) -> contact.Kink:
-    """Return a rise in the file's time, s, or rows, on the clock of the samples.
-
-    Without time it counts samples from the `first` row kept, each of which is `block` rows.
-    """
-    if record.time is not None:
-        return rise[0] - record.origins.get("contact_time", 0.0), rise[1]
-    return (rise[0] - first - 0.5 * (block - 1)) / block, rise[1] / block
 
 
 def _stated_of_blocks(stated: Noise, levels: contact.Levels, record: Record, block: int) -> Noise:
@@ -180,17 +173,13 @@ def _measured(
 
 
 def first_rise(record: Record, start: contact.Start, levels: contact.Levels) -> contact.Kink | None:
-    """Return the file's time of contact by the first rise of the stress, or of a gauge at rest.
-
-    The zeros of `record` are taken off.
-    """
+    """Return the contact by the first rise of the stress, or of a gauge at rest, less its zero."""
     moved = start.by == "motion" and start.gauge == "rest"
     name = "displacement" if moved else "stress"
     values, zero = record.channel(name), record.zeros.get(name)
     if values is None or name in record.derived:
         return None
-    rise = contact.rise_of(record.instants, values, levels[name], start.resting, zero)
-    return rise and (rise[0] + record.origins.get("contact_time", 0.0), rise[1])
+    return contact.rise_of(record.instants, values, levels[name], start.resting, zero)
 
 
 def cut_to_contact(record: Record, start: contact.Start, span: zeros.Span) -> Record:
