@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.contact import ELSEWHERE, Levels, Start, motion_leaves_rest, straight
+from foamfit.data.contact import ELSEWHERE, Levels, Start
 from foamfit.data.measurement import (
     GRAVITY,
     UNITS,
@@ -71,9 +71,7 @@ def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
     end = min(len(record), first + found + max(3, after)) if returned else len(record)
     # If few rows precede contact, half of them are kept and the others determine the zeros.
     lead = min(max(_LEAST_LEAD, found // 10), first // 2 if first >= 2 * _FEWEST else first)
-    late = int(3 * start.error / float(np.median(np.diff(record.instants))))
-    rest = first - max(lead, min(late, 2 * first // 3))
-    return Span(first - lead, end, rest, first + found, returned)
+    return Span(first - lead, end, first - lead, first + found, returned)
 
 
 def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
@@ -81,8 +79,7 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
 
     A crest of a vibration is not flat. The end is extended backwards as long as the preceding rows
     agree with its level within one standard error, a strict limit because a soft end of contact
-    stays below the noise for long. The correlation of few rows is unknown, so their mean gets the
-    standard error of one row.
+    stays below the noise for long.
     """
     size = max(8, int(_TAIL * len(values)))
     step, n = max(4, size // 2), size
@@ -101,8 +98,6 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
         level = mean_level(values[-n:], noise)
     # The rows next to the end of contact may still be loaded.
     level = mean_level(values[step - n :], noise) if n > 2 * step else level
-    if level.samples < MIN_REST:
-        level = level._replace(error=max(level.error, noise.sigma))
     return level if abs(level.value) < _HIGHEST * float(np.ptp(values)) else None
 
 
@@ -126,11 +121,6 @@ def take_zeros(
                 record = record.noted(f"{drifts} before contact, so its zero is as uncertain.")
             known, least = zero.samples > 0, 0.0
             steps = _of_steps(values, values[:n]) if known else 0.0
-            if impact and steps > zero.error:  # rows on one level do not show the zero again
-                away = np.ones(len(record), dtype=bool)
-                away[start.first : span.leaves] = False
-                seen = record.sampled.get(name, ~away)
-                record = replace(record, sampled=record.sampled | {name: seen & ~away})
             zero = zero._replace(error=float(np.hypot(zero.error, steps)))
         else:
             zero, how = _zero_of_motion(name, first, start, n, noise, impact=impact)
@@ -220,7 +210,6 @@ def _zero_of_motion(
         return mean_level(values[:rows], noise), f"mean of {rows} samples at rest before contact"
     flies = top and start.gauge == "flight"
     reach = max(5, (int(np.argmax(values)) - first) // (24 if flies else 12))
-    reach = reach if impact else straight(time, values, first, reach, noise)
     near = slice(max(0, first - reach) if flies else first, first + reach)
     zero = polynomial_at(time[near], values[near], start.time, noise)[0]
     source = f"line through {zero.samples} samples {'around it' if flies else 'from there on'}"
@@ -268,8 +257,6 @@ def mark_flight(record: Record, start: Start, span: Span, levels: Levels) -> Rec
     moves = record.instants > max(2.5 * step, 2 * start.error)
     if start.gauge == "rest":
         moves &= touching
-        if at := motion_leaves_rest(record, levels):  # possibly late
-            moves &= record.instants > at[0] + max(2.5 * step, 2 * at[1])
     kept = record.sampled.get("displacement", np.ones(len(record), dtype=bool))
     return replace(record, sampled=record.sampled | {"displacement": kept & moves})
 
