@@ -313,6 +313,7 @@ VOLTS = (
     '[columns]\ntime = { column = "X_Value", unit = "s" }\n'
     'force = { column = "Load", unit = "V", scale = "4444.4 N/V" }\n'
 )
+ACCELERATION = 'acceleration = { column = "Acceleration", unit = "V", scale = "9586.5 m/s^2/V" }\n'
 
 
 @needs_data
@@ -320,11 +321,7 @@ VOLTS = (
     ("more", "motion", "strain"),
     [
         ("", "integrated from force", 0.90),
-        (
-            'acceleration = { column = "Acceleration", unit = "V", scale = "9586.5 m/s^2/V" }\n',
-            "integrated from acceleration",
-            0.79,
-        ),
+        (ACCELERATION, "integrated from acceleration", 0.79),
     ],
 )
 def test_cartilage_as_labview_wrote_it(tmp_path, more, motion, strain):

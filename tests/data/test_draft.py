@@ -90,10 +90,8 @@ def test_what_no_header_says_is_proposed_only_without_an_alternative(
     if "load cell (N)" not in proposed:
         assert len(asked) == 2
     if "Channel A (V)" in proposed:
-        assert (
-            'scale = "100 N/V" }  # needed: a force (N) or a stress (MPa), with the scale'
-            in (loads[0])
-        )
+        scaled = 'scale = "100 N/V" }  # needed: a force (N) or a stress (MPa), with the scale'
+        assert scaled in loads[0]
 
 
 @pytest.mark.parametrize(

@@ -67,35 +67,28 @@ def test_a_workbook_in_another_format_can_be_saved_as_a_table(
     refused(path, f"is {what}; open it in a spreadsheet and save it as CSV or .xlsx.")
 
 
+MINUS = [f"{t},\u2212{f},\u2212{w}" for t, f, w in zip(T, F, W, strict=True)]  # minus signs
+EMPTY, BELOW = "no numbers in the columns in use", "statistics below the table"
+
+
 @pytest.mark.parametrize(
-    ("rows", "unused"),
+    ("rows", "unused", "first", "why"),
     [
-        ([*ROWS, "# end of the test", "stopped by the operator,,"], 2),
-        ([*ROWS, *(f"{t:g},," for t in (10.1, 10.2, 10.3))], 3),
-        ([*ROWS[:50], "2.475,,", *ROWS[50:]], 1),
+        ([*ROWS, "# end of the test", "stopped by the operator,,"], 2, 203, EMPTY),
+        ([*ROWS, *(f"{t:g},," for t in (10.1, 10.2, 10.3))], 3, 203, EMPTY),
+        ([*ROWS[:50], "2.475,,", *ROWS[50:]], 1, 52, EMPTY),
+        ([*MINUS, "Max force,200,N"], 1, 203, "a remark below the table"),
+        ([*ROWS, "Mean,100,2", "", "Std. Dev.,1,1"], 2, 203, BELOW),
+        ([*MINUS, "15,100,2,mean", "max,30,200,4"], 2, 203, BELOW),  # with a column more
     ],
 )
-def test_rows_without_a_force_and_a_motion_are_counted(
-    tmp_path: Path, rows: list[str], unused: int
+def test_rows_that_are_no_samples_are_counted(
+    tmp_path: Path, rows: list[str], unused: int, first: int, why: str
 ) -> None:
     test = read_test(write_lines(tmp_path, [PLAIN, *rows]))
     assert (test.rows.rows, test.rows.used) == (T.size + unused, T.size)
     (item,) = test.rows.dropped
-    assert (item.rows, item.why) == (unused, "no numbers in the columns in use")
-
-
-@pytest.mark.parametrize(
-    ("below", "why"),
-    [
-        (["Max force,200,N"], "a remark below the table"),
-        (["Mean,100,2", "", "Std. Dev.,1,1"], "statistics below the table"),
-        (["15,100,2,mean", "max,30,200,4"], "statistics below the table"),  # with a column more
-    ],
-)
-def test_results_below_the_table_are_no_samples(tmp_path: Path, below: list[str], why: str) -> None:
-    rows = [f"{t},\u2212{f},\u2212{w}" for t, f, w in zip(T, F, W, strict=True)]  # minus signs
-    (item,) = read_test(write_lines(tmp_path, [PLAIN, *rows, *below])).rows.dropped
-    assert (item.rows, item.first, item.why) == (len([*filter(None, below)]), T.size + 2, why)
+    assert (item.rows, item.first, item.why) == (unused, first, why)
 
 
 @pytest.mark.parametrize(

@@ -193,14 +193,17 @@ def test_without_headers_columns_have_numbers(tmp_path, sep):
     refused(write(tmp_path, lines, toml.replace("N", "mm")), "'column 1'", "wrong dimension")
 
 
-def test_a_header_that_is_not_understood_is_quoted_with_the_lines_that_help(tmp_path):
-    lines = ["Aika [s],Voima [N],Siirtymä [mm]", *rows(TIME, FORCE, MOTION)]
-    helping = (
-        'force = { column = "Voima [N]" }', 'displacement = { column = "Siirtymä [mm]" }',
-        'time = { column = "Aika [s]" }',
-    )  # fmt: skip
-    refused(write(tmp_path, lines), "there are 'Aika [s]', 'Voima [N]'", *helping)
-    expect(read_test(write(tmp_path, lines, COLUMNS + "\n".join(helping))))
+@pytest.mark.parametrize(
+    ("names", "encoding"),
+    [("Aika [s],Voima [N],Siirtymä [mm]", "utf-8"), ("時間 [s],荷重 [N],変位 [mm]", "cp932")],
+)
+def test_a_header_not_understood_is_quoted_with_the_lines_that_help(tmp_path, names, encoding):
+    lines, quoted = [names, *rows(TIME, FORCE, MOTION)], [f'"{n}"' for n in names.split(",")]
+    channels = zip(("time", "force", "displacement"), quoted, strict=True)
+    helping = [f"{channel} = {{ column = {name} }}" for channel, name in channels]
+    there = "there are " + ", ".join(quoted[:2]).replace('"', "'")
+    refused(write(tmp_path, lines, encoding=encoding), there, *helping)
+    expect(read_test(write(tmp_path, lines, COLUMNS + "\n".join(helping), encoding=encoding)))
     lines[0] = "Aika,Voima,Siirtymä"
     refused(write(tmp_path, lines), "'Voima'", 'force = { column = "…", unit = "N" }')
 
