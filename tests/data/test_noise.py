@@ -214,5 +214,7 @@ def test_a_steep_short_peak_is_no_gap() -> None:
     rise, fall, rest = np.linspace(0.0, 246.4, 149), np.arange(239.6, 10.0, -26.2), np.zeros(140)
     force = np.array([*rise, *peak, *fall, *rest])
     assert not find_outliers(force).any()
+    often = np.arange(force.size) % 20 == 5
+    assert np.array_equal(find_outliers(np.where(often, 9999.0, force)), often)  # for no value
     force[40:44] = 0.0  # a real gap in the same record
     assert np.flatnonzero(find_outliers(force)).tolist() == [40, 41, 42, 43]

@@ -116,12 +116,12 @@ def test_a_staircase_becomes_its_ramp():
     t = np.arange(1000) * 1e-3
     w = 1e-4 * np.sin(np.pi * t)
     held = w[np.arange(1000) // 5 * 5]
-    filled = fill_staircase(Record(t, w, held))
+    filled, _ = fill_staircase(Record(t, w, held))
     assert np.abs(filled.displacement - w)[:-5].max() < 0.02 * np.abs(held - w).max()
     assert "5 samples" in filled.notes[0]
     assert np.flatnonzero(filled.sampled["displacement"]).tolist() == list(range(0, 1000, 5))
     coarse = Record(t, w, np.round(w / 1e-6) * 1e-6)  # by a digitiser, several rows to a step
-    assert fill_staircase(coarse).displacement is coarse.displacement
+    assert fill_staircase(coarse)[0].displacement is coarse.displacement
 
 
 def followed(record, share=0.4, zero=3e-3, noise=0.0):

@@ -17,7 +17,6 @@ from foamfit.data.outliers import find_outliers, fresh_samples
 from foamfit.errors import InputError
 from foamfit.text import counted, engineering
 
-_FEW = 8  # fewer frames are interpolated linearly
 _PAUSE = 6.0  # a longer step, in usual steps, is a pause and is interpolated linearly
 
 
@@ -101,16 +100,13 @@ def _nearest(time: Array, at: Array) -> NDArray[np.intp]:
 
 
 def _through(at: Array, values: Array, time: Array) -> Array:
-    """Interpolate by a cubic spline; linearly if samples are few, or across a pause."""
+    """Interpolate by a cubic spline, across a pause linearly."""
     from scipy.interpolate import CubicSpline
 
-    straight = np.interp(time, at, values)
-    if at.size < _FEW:
-        return straight
     step = np.diff(at)
     gap = np.clip(np.searchsorted(at, time, side="right") - 1, 0, step.size - 1)
     pause = step[gap] > _PAUSE * float(np.median(step))
-    return np.where(pause, straight, CubicSpline(at, values)(time))
+    return np.where(pause, np.interp(time, at, values), CubicSpline(at, values)(time))
 
 
 def _averaged(at: Array, values: Array, time: Array) -> Array:

@@ -61,14 +61,14 @@ def find_outliers(values: Array, time: Array | None = None) -> Mask:
     spike deviates by four standard deviations from the cubic through its eight neighbours, while
     the neighbours are consistent and the lines through either side do not lead to the spike.
     Samples at a pause are not tested, and in a held channel only gaps are found. If more than 2 %
-    of the samples stand out, none is an outlier.
+    of the samples stand out, none is an outlier, unless all have one value, as 9999 for no value.
     """
     n = values.size
     if n < _FEWEST:
         return np.zeros(n, dtype=bool)
     least = _LEAST * float(np.ptp(np.quantile(values, (0.005, 0.995))))
     at = np.arange(n, dtype=np.float64) if time is None else time
-    wrong = _gaps(values, at)
+    wrong = _gaps(values)
     for _ in range(4):  # a large spike hides small ones next to it
         smooth = _bridged(values, wrong, at)
         if is_staircase(smooth):
@@ -77,21 +77,21 @@ def find_outliers(values: Array, time: Array | None = None) -> Mask:
         if not found.any():
             break
         wrong |= found
-    return wrong if wrong.sum() <= max(_MOST * n, 2) else np.zeros(n, dtype=bool)
+    few = wrong.sum() <= max(_MOST * n, 2) or np.ptp(values[wrong]) == 0.0
+    return wrong if few else np.zeros(n, dtype=bool)
 
 
 def _bridged(values: Array, wrong: Mask, time: Array) -> Array:
     return np.where(wrong, np.interp(time, time[~wrong], values[~wrong]), values)
 
 
-def _gaps(values: Array, time: Array) -> Mask:
+def _gaps(values: Array) -> Mask:
     """Find short runs with opposite jumps at both ends."""
     from scipy.ndimage import median_filter
 
     out = np.zeros(values.size, dtype=bool)
-    jump, step = np.diff(values), np.diff(time)
-    # During a longer step of time the signal itself may change more.
-    usual = np.abs(jump) / np.maximum(step / median_filter(step, _NEARBY), 1.0)
+    jump = np.diff(values)
+    usual = np.abs(jump)
     floor = float(np.median(usual[usual > 0.0])) if usual.any() else 0.0
     high = np.flatnonzero(usual > _JUMP * np.maximum(median_filter(usual, _NEARBY), floor))
     for start, end in ((i, j) for i in high for j in high[(high > i) & (high <= i + _MAX_RUN)]):
@@ -261,35 +261,26 @@ def is_staircase(values: Array) -> bool:
     return not (gaps.size and np.median(steps) < 1.5 * gaps.min())  # usually by a single step
 
 
-def noise_of_held(record: Record) -> dict[str, NoiseLevel]:
-    """Return the noise of held or interpolated displacements, from fresh samples or frames."""
-    levels = {}
+def fill_staircase(record: Record) -> tuple[Record, dict[str, NoiseLevel]]:
+    """Interpolate displacements that are updated less often than the stress.
+
+    Return also the noise of held or interpolated displacements, from fresh samples or frames. Only
+    samples with a new value count as measured. A value held for more than three usual steps is a
+    real hold, which lasts until one usual step before the next new value.
+    """
+    time, levels = record.instants, dict[str, NoiseLevel]()
     for name, values in record.curves().items():
         if name in record.sampled:
             frames = values[record.sampled[name]]
             level = estimated_noise(frames, "frames on their own clock")
             levels[name] = replace(level, time=level.time * len(values) / len(frames))
-        elif name != "stress" and is_staircase(values):
-            fresh = values[fresh_samples(values)[0]]
-            if len(fresh) >= MIN_ROWS:
-                level = estimated_noise(fresh, "fresh samples")
-                levels[name] = replace(level, time=len(values) / len(fresh))
-    return levels
-
-
-def fill_staircase(record: Record) -> Record:
-    """Interpolate displacements that are updated less often than the stress.
-
-    Only samples with a new value count as measured. A value held for more than three usual steps is
-    a real hold, which lasts until one usual step before the next new value.
-    """
-    time = record.instants
-    for name, values in record.curves().items():
-        fresh, lengths = fresh_samples(values)
-        step = int(np.median(lengths))
-        known = name == "stress" or name in record.sampled
-        if known or len(lengths) < MIN_ROWS or not is_staircase(values):
             continue
+        fresh, lengths = fresh_samples(values)
+        if name == "stress" or len(fresh) < MIN_ROWS or not is_staircase(values):
+            continue
+        level = estimated_noise(values[fresh], "fresh samples")
+        levels[name] = replace(level, time=len(values) / len(fresh))
+        step = int(np.median(lengths))
         knots = np.union1d(fresh, (fresh + lengths - step)[lengths > 3 * step])
         label = "The displacement" if name == "displacement" else name
         line = np.interp(time, time[knots], values[knots])
@@ -297,7 +288,7 @@ def fill_staircase(record: Record) -> Record:
             f"{label} is held for about {step} samples at a time; it is interpolated between the "
             f"{len(fresh)} instants where it is fresh."
         )
-    return record
+    return record, levels
 
 
 def find_standstills(record: Record) -> list[tuple[int, int]]:
@@ -334,12 +325,7 @@ def find_standstills(record: Record) -> list[tuple[int, int]]:
 
 def _jumps(w: Array, noise: float, step: int, width: int) -> dict[int, int]:
     """Return the first samples after jumps from a standstill, and the length of each jump."""
-    from scipy.ndimage import maximum_filter1d, minimum_filter1d
-
-    n = len(w)
-    # The window of sample i ends at sample i.
-    shift: Any = {"size": width, "origin": (width - 1) // 2, "mode": "nearest"}
-    range_before = maximum_filter1d(w, **shift) - minimum_filter1d(w, **shift)
+    n, ranges = len(w), np.ptp(sliding_window_view(w, width), axis=1)
     least = max(_LEAP * float(np.ptp(w)), _ABOVE_NOISE * noise, _DIGITS * quantum(w))
     found = dict[int, int]()
     for length in range(_LONGEST, 0, -1):  # shorter jumps replace longer ones
@@ -348,7 +334,7 @@ def _jumps(w: Array, noise: float, step: int, width: int) -> dict[int, int]:
         far = np.abs(jump)
         later = np.minimum(last + length + 2 * max(step, length), n - 1)
         goes_on = (w[later] - w[last + length]) * np.sign(jump) > _GOES_ON * far
-        stands = range_before[last] <= _STANDS * far + _SCATTER * noise
+        stands = ranges[last - width + 1] <= _STANDS * far + _SCATTER * noise
         good = (far >= least) & stands & ~goes_on
         found |= dict.fromkeys((last[good] + length).tolist(), length)
     return found

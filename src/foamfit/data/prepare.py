@@ -70,9 +70,9 @@ def condition(
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
     record = repair.cut_strays(cut_to_window(record, window))
     record = repair.mark_clipped(repair.bridge_outliers(record))
-    held = repair.noise_of_held(record)
     still = [] if impact else repair.find_standstills(record)
-    record = repair.bridge_standstills(repair.fill_staircase(record), still, specimen.height)
+    record, held = repair.fill_staircase(record)
+    record = repair.bridge_standstills(record, still, specimen.height)
     excess = record.excess
     found = [] if impact else cycles.find_cycles(record)
     chosen = cycles.choose_cycles(found, window.cycle, window.last)
@@ -90,7 +90,7 @@ def condition(
     else:
         start = contact.start_of_slow_test(first, levels)
         end = len(first) if used.place else used.end - used.first
-        span = zeros.Span(start.first, end, start.resting, end)
+        span = zeros.Span(start.first, end, end)
     record = zeros.take_zeros(record, first, start, span, levels, impact=impact)
     if used.place:  # a later cycle has its own contact
         record = cycles.cut_to_reload(record, found, used, specimen.height)
@@ -101,7 +101,7 @@ def condition(
         record = cycles.cut_to_cycle(record, found, chosen) if chosen else record
         record = cut_to_contact(record, start, span)
     if impact:
-        record = zeros.mark_flight(record, start, span, levels)
+        record = zeros.mark_flight(record, start, span)
         record = start_within_height(integrate_motion(record, specimen, given), specimen, given)
     else:
         record = replace(integrate_motion(record, specimen, given), acceleration=None)

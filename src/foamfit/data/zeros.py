@@ -43,14 +43,13 @@ CONTRADICTED = "but the striker's velocity is given as"
 
 @dataclass(frozen=True)
 class Span:
-    """Rows around contact: `first` to `end` are kept, those before `rest` determine the zeros.
+    """Rows around contact: `first` to `end` are kept.
 
     Contact ends at the row `leaves`; `returned` is whether the stress has returned to zero there.
     """
 
     first: int
     end: int
-    rest: int
     leaves: int
     returned: bool = True
 
@@ -71,7 +70,7 @@ def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
     end = min(len(record), first + found + max(3, after)) if returned else len(record)
     # If few rows precede contact, half of them are kept and the others determine the zeros.
     lead = min(max(_LEAST_LEAD, found // 10), first // 2 if first >= 2 * _FEWEST else first)
-    return Span(first - lead, end, first - lead, first + found, returned)
+    return Span(first - lead, end, first + found, returned)
 
 
 def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
@@ -79,7 +78,8 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
 
     A crest of a vibration is not flat. The end is extended backwards as long as the preceding rows
     agree with its level within one standard error, a strict limit because a soft end of contact
-    stays below the noise for long.
+    stays below the noise for long. The correlation of few rows is unknown, so their mean gets the
+    standard error of one row.
     """
     size = max(8, int(_TAIL * len(values)))
     step, n = max(4, size // 2), size
@@ -98,6 +98,8 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
         level = mean_level(values[-n:], noise)
     # The rows next to the end of contact may still be loaded.
     level = mean_level(values[step - n :], noise) if n > 2 * step else level
+    if level.samples < MIN_REST:
+        level = level._replace(error=max(level.error, noise.sigma))
     return level if abs(level.value) < _HIGHEST * float(np.ptp(values)) else None
 
 
@@ -109,7 +111,7 @@ def take_zeros(
     If too few rows precede the contact of an impact, the zero of the force is taken from the end of
     the record. If that is impossible, the zero of the file remains.
     """
-    errors, n = dict[str, float](), span.rest
+    errors, n = dict[str, float](), span.first if impact else start.resting
     for name, values in first.curves("acceleration").items():
         if name in record.derived:
             continue
@@ -121,6 +123,11 @@ def take_zeros(
                 record = record.noted(f"{drifts} before contact, so its zero is as uncertain.")
             known, least = zero.samples > 0, 0.0
             steps = _of_steps(values, values[:n]) if known else 0.0
+            if impact and steps > zero.error:  # rows on one level do not show the zero again
+                away = np.ones(len(record), dtype=bool)
+                away[start.first : span.leaves] = False
+                seen = record.sampled.get(name, ~away)
+                record = replace(record, sampled=record.sampled | {name: seen & ~away})
             zero = zero._replace(error=float(np.hypot(zero.error, steps)))
         else:
             zero, how = _zero_of_motion(name, first, start, n, noise, impact=impact)
@@ -241,7 +248,7 @@ def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker)
     return "other"
 
 
-def mark_flight(record: Record, start: Start, span: Span, levels: Levels) -> Record:
+def mark_flight(record: Record, start: Start, span: Span) -> Record:
     """Mark rows in which a gauge does not follow the striker or the specimen as not measured.
 
     After contact the specimen may stay on its base or leave with the striker: its interior motions
