@@ -116,7 +116,7 @@ def _of_striker(test: Measurement, shown: Balance) -> list[Contradiction]:
     # If the motion is too fast and too long by one factor, its scale alone may be wrong.
     if len(found) == 2 and abs(found[0].ratio / found[1].ratio - 1.0) < found[1].limit:
         ratio, limit = found[1].ratio, found[1].limit
-        says = f"the motion is {ratio:.2f} times as large as mass, velocity and force imply"
+        says = f"the motion is {ratio:#.3g} times as large as mass, velocity and force imply"
         entry = test.entries.get("displacement", Entry("displacement"))
         lines = ((entry.table, entry.times(1.0 / ratio, TENTH * limit)),)
         return [Contradiction("motion_scale", 1.0 / ratio, limit, says, lines)]
@@ -135,7 +135,7 @@ def _limit(test: Measurement, error: float, *quantities: str) -> float:
 def _of_force(test: Measurement, ratio: float, limit: float, mass: float) -> Contradiction:
     """Return the contradiction between mass, scale of the force and motion."""
     what = "acceleration" if test.braked else "force"
-    says = f"the impulse of the {what} is {1.0 / ratio:.2f} of the change of momentum in the "
+    says = f"the impulse of the {what} is {1.0 / ratio:#.3g} of the change of momentum in the "
     says += f"motion, so {'' if test.braked else 'mass, '}scale of the {what} and motion disagree"
     entry = test.entries.get("stress", Entry(what))
     lines = [(entry.table, entry.times(ratio, TENTH * limit))]

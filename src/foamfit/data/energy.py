@@ -53,10 +53,10 @@ class EnergyAudit:
         if taken is None or 0.9 <= taken <= 1.05 or self.damping is not None:  # that takes it up
             return []
         if taken > 1.05:
-            how = f"{taken:.2f} times {brought}, which is impossible"
+            how = f"{taken:#.3g} times {brought}, which is impossible"
             wrong = "mass, velocity, force and motion do not agree"
         else:
-            how = f"only {taken:.2f} of {brought}"
+            how = f"only {taken:#.3g} of {brought}"
             wrong = "mass, velocity, force and motion do not agree, or the record ends too early"
         return [f"Check: the foam absorbs {how}; {wrong}."]
 

@@ -36,7 +36,8 @@ _STATISTICS = re.compile(
     "sem|var(iance|ianz)?|min(imum)?|max(imum)?|range|count|n|sum|summe|25%|50%|75%"
 )
 _STATISTICS_ROWS = 12  # most of these
-_MISSING = ("", "nan", "na", "n/a", "#n/a")  # what programs write for a missing number
+# What programs write for a missing number
+_MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "none"}
 # A time of day such as 12:00:00.5 or 3:00:00.5 PM, with or without a date before it.
 _OF_DAY = re.compile(
     r"(?:[\d./-]+[T ]+)?(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,]\d+)?)(?: ?([ap])m|Z)?",
@@ -301,9 +302,8 @@ def _is_words(cells: list[str]) -> bool:
     """Return whether a row below the header still belongs to it: a rule, or words only."""
     filled = list(filter(None, cells))
     rule = re.fullmatch(r"[-=+:|\s]*[-=]{3}[-=+:|\s]*", "".join(cells)) is not None
-    missing = {"n/a", "na", "nan", "null", "none", "inf"}
     words = bool(filled) and not any(re.match(r"[+-]?[.,]?\d", cell) for cell in filled)
-    return rule or (words and not {cell.casefold() for cell in filled} & missing)
+    return rule or (words and not {cell.casefold() for cell in filled} & (_MISSING | {"inf"}))
 
 
 def read_numbers(
