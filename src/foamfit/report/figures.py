@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -95,16 +95,20 @@ def grid_of(
 
 
 @contextmanager
-def drawing(width: float, height: float, *title: str) -> Iterator[Figure]:
+def drawing(
+    width: float, height: float, *title: str, layout: Literal["constrained"] | None = "constrained"
+) -> Iterator[Figure]:
     """Yield an empty figure in the common style; the title adds to its height (inches)."""
     import matplotlib
     from matplotlib.figure import Figure
 
     lines = [line for part in title for line in wrapped(part, 0, int(LETTERS * width))]
+    height += LINE * len(lines)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(width, height + LINE * len(lines)), layout="constrained")
+        figure = Figure(figsize=(width, height), layout=layout)
         if lines:  # a dollar sign in a name does not start a formula
             style: Any = {"fontsize": 8, "parse_math": False}
+            style |= {} if layout else {"y": 1.0 - 0.05 / height}
             figure.suptitle("\n".join(lines), x=0.01, ha="left", **style)
         yield figure
 
@@ -167,11 +171,29 @@ def _file(figure: Figure, form: Format, dpi: int) -> bytes:
     buffer = io.BytesIO()
     # Without a date the same fit gives the same file.
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(form)
-    figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata)
+    more: Any = {"pil_kwargs": {"compress_level": 3}} if form == "png" else {}  # twice as fast
+    with _small_fonts() if form == "pdf" else nullcontext():
+        figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata, **more)
     if form != "svg":
         return buffer.getvalue()
     # Verdana has nearly the same widths, where a browser lacks the font.
     return buffer.getvalue().replace(b"'DejaVu Sans'", b"'DejaVu Sans', Verdana, sans-serif")
+
+
+@contextmanager
+def _small_fonts() -> Iterator[None]:
+    """Embed fonts without tables of ligatures and kerning, which take longest to write.
+
+    A PDF has its own places of glyphs, and matplotlib no option for these tables.
+    """
+    from fontTools.subset import Options
+
+    before = Options._drop_tables_default
+    Options._drop_tables_default = [*before, "GDEF", "GPOS", "GSUB"]
+    try:
+        yield
+    finally:
+        Options._drop_tables_default = before
 
 
 def limits(values: Sequence[float], ends: Sequence[float]) -> tuple[float, float]:

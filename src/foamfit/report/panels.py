@@ -183,6 +183,7 @@ def draw_below(ax: Axes, strip: Axes, panel: Panel) -> None:
     strip.axhline(0.0, color=GREY, lw=0.6, zorder=1)
     strip.set(xlabel=ax.get_xlabel(), label=f"{panel.name}, {panel.below_name}")
     strip.set_ylabel(f"{panel.below_name}\n(% of range)", fontsize=7)
+    strip.ticklabel_format(axis="y", scilimits=(-2, 4))  # long numbers would cover the label
     strip.sharex(ax)
     ax.set_xlabel("")
     ax.tick_params(labelbottom=False)

@@ -33,12 +33,14 @@ if TYPE_CHECKING:
 
 MOST_NAMED = 12  # loops up to which a legend names all
 # Typographic points: height of panels side by side, of stacked panels and of a residual strip.
-HEIGHT, STACKED, STRIP = 133.0, 112.0, 40.0
-BESIDE_IT, BELOW_IT, LEGEND = 51.0, 26.0, 26.0  # room for labels and for the legend
+HEIGHT, STACKED, STRIP = 127.0, 106.0, 40.0
+# Room around a panel, above it if it has a title, between it and its strip, and for the legend.
+LEFT, RIGHT, ABOVE, BELOW, TITLE, GAP, LEGEND = 53.0, 8.0, 6.0, 29.0, 12.0, 5.0, 18.0
+ASIDE, BENEATH = 31.0, 16.0  # distance of the labels from the axes
 MOST_WIDE = {0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}  # largest width in inches, by number of panels
 INSTANTS = 7  # pictures of a foam
 SNAPPED, STANDING = "#7FB2D9", "#E6EEF4"  # shades of the snapped part and of the rest of a spring
-LOOP, WIDER = 165.0, 1.45  # prescribed motion: height of the loop, its width over that of others
+LOOP, WIDER = 159.0, 1.45  # prescribed motion: height of the loop, its width over that of others
 Drawn = tuple["Axes", Panel, tuple[float, float]]  # axes, panel, and its size in points
 
 
@@ -148,42 +150,49 @@ def origin_word(result: Fit) -> str | None:
 def panelled(
     panels: list[Panel], width: str, *title: str, strips: bool = False, known: bool = False
 ) -> Iterator[tuple[Figure, list[Drawn]]]:
-    """Yield a figure with its panels drawn, and add a legend at the end.
+    """Yield a figure with its panels drawn; add a legend and place the panels at the end.
 
     Strips are drawn below the panels if wanted; for a `known` motion the first panel is largest.
+    Places are given, as finding them from the sizes of all texts takes as long as drawing the
+    figure.
     """
     count = max(len(panels), 1)
     wide = min(figures.inches(width), MOST_WIDE[3 if known and count > 1 else min(len(panels), 3)])
     across = figures.abreast(wide, count)
-    rows, every = -(-count // across), 2 if strips else 1
-    parts = [WIDER if known else 1.0, *[1.0] * (across - 1)]
-    spans = [72.0 * wide * part / sum(parts) - BESIDE_IT for part in parts]
+    rows, parts = -(-count // across), [WIDER if known else 1.0, *[1.0] * (across - 1)]
+    spans = [(72.0 * wide - RIGHT) * part / sum(parts) - LEFT for part in parts]
     tall = LOOP if known and across > 1 else HEIGHT if rows == 1 else STACKED
-    heights = [tall, STRIP][:every] * rows
-    height = (sum(heights) + rows * BELOW_IT + LEGEND) / 72.0
-    with figures.drawing(wide, height, *figures.title(width, *title)) as figure:
-        ratios = {"width_ratios": parts, "height_ratios": heights}
-        grid = figure.subplots(every * rows, across, squeeze=False, gridspec_kw=ratios)
-        axes, below = grid[::every].ravel().tolist(), grid[1::every].ravel().tolist()
-        for ax in [*axes[len(panels) :], *below[len(panels) :]]:
-            ax.set_axis_off()
+    below = GAP + STRIP if strips else 0.0
+    top = ABOVE + max((TITLE for panel in panels if panel.title), default=0.0)
+    cell = top + tall + below + BELOW
+    height, title = (rows * cell + LEGEND) / 72.0, figures.title(width, *title)
+    with figures.drawing(wide, height, *title, layout=None) as figure:
+        title_high = 72.0 * (figure.get_figheight() - height)
+        axes = [figure.add_axes((0.0, 0.0, 1.0, 1.0)) for _ in range(count)]
         if not panels:
             figures.say_nothing_there(axes[0])
-        drawn = list[Drawn]()
+        drawn, places = list[Drawn](), list[Any]()
         for i, (ax, panel) in enumerate(zip(axes, panels, strict=False)):
+            (row, column), high = divmod(i, across), tall
+            x, y = (column + 1) * LEFT + sum(spans[:column]), title_high + row * cell + top
             draw(ax, panel)
-            high = tall
             if strips and panel.below:
-                draw_below(ax, below[i], panel)
-            elif strips:  # the panel fills their place
-                below[i].remove()
-                at = ax.get_subplotspec().rowspan.start
-                ax.set_subplotspec(ax.get_gridspec()[at : at + 2, i % across])
-                high += STRIP
-            drawn.append((ax, panel, (spans[i % across], high)))
+                strip = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+                draw_below(ax, strip, panel)
+                places.append((strip, x, y + tall + GAP, spans[column], STRIP))
+            else:
+                high += below
+            places.append((ax, x, y, spans[column], high))
+            drawn.append((ax, panel, (spans[column], high)))
         yield figure, drawn
-        figure.align_ylabels()
         figures.legend_below(figure, figures.named_in(figure.axes))
+        whole = 72.0 * figure.get_figheight()
+        for ax, x, y, span, high in places:
+            ax.set_position(
+                (x / 72.0 / wide, 1.0 - (y + high) / whole, span / 72.0 / wide, high / whole)
+            )
+            ax.yaxis.set_label_coords(-ASIDE / span, 0.5)
+            ax.xaxis.set_label_coords(0.5, -BENEATH / high)
 
 
 def figures_of(result: Fit, width: str = TWO) -> dict[str, Figure]:

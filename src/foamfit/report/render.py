@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import json
 import math
+import sys
 from base64 import b64encode
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,11 +23,21 @@ if TYPE_CHECKING:
 def environment() -> Environment:
     """Return the templates of all pages, texts and cards, with filters that format numbers."""
     from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, select_autoescape
+    from jinja2.bccache import Bucket, FileSystemBytecodeCache
+
+    class Compiled(FileSystemBytecodeCache):
+        """Keeps compiled templates beside the compiled modules, if that folder can be written."""
+
+        def dump_bytecode(self, bucket: Bucket) -> None:
+            if not sys.dont_write_bytecode:
+                with suppress(OSError):
+                    super().dump_bytecode(bucket)
 
     made = Environment(
         loader=ChoiceLoader([PackageLoader(f"foamfit.{of}") for of in ("report", "cards", "page")]),
         extensions=["jinja2.ext.do"],
         autoescape=select_autoescape(("html",)),
+        bytecode_cache=Compiled(str(Path(__file__).with_name("__pycache__"))),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
