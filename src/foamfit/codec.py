@@ -21,6 +21,7 @@ from foamfit.errors import InputError
 from foamfit.springs.spring import Spring
 
 Columns = Mapping[str, Array]
+_hints = cache(get_type_hints)
 _PARAMETER = ("value", "vary", "min", "max", "stderr", "expr")
 _NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
@@ -110,19 +111,13 @@ def build(made: Any, content: Mapping[str, Any], columns: Columns, **names: Any)
     `names` are the names in its annotations that its module imports for typing only. Raises
     KeyError, TypeError, ValueError or AttributeError if a field is missing or invalid.
     """
-    hints = get_type_hints(made, localns=names) if names else _hints(made)
+    hints = get_type_hints(made, localns=names) if names else _hints(made)  # slow: kept
     given = {}
     for one in fields(made):
         missing = one.default is MISSING and one.default_factory is MISSING
         if missing or one.name in content:
             given[one.name] = decode(hints[one.name], content[one.name], columns)
     return made(**given)
-
-
-@cache
-def _hints(made: Any) -> dict[str, Any]:
-    """Return the types of a dataclass's fields; finding them takes most of the time of `build`."""
-    return get_type_hints(made)
 
 
 def _parameters(params: Any, content: Mapping[str, Any]) -> Any:

@@ -15,7 +15,7 @@ from foamfit.text import wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, SubFigure
+    from matplotlib.figure import Figure
 
 
 Format = Literal["png", "pdf", "svg"]
@@ -82,16 +82,6 @@ def abreast(width: float, panels: int, least: float = 2.1) -> int:
 def tail(name: str, most: int) -> str:
     """Return a name, or only its end if it is longer than `most` characters."""
     return name if len(name) <= most else f"…{name[1 - most :]}"
-
-
-def grid_of(
-    part: Figure | SubFigure, rows: int, columns: int, count: int, **more: Any
-) -> list[Axes]:
-    """Return the first `count` panels of a grid, row by row; the others stay empty."""
-    every: list[Axes] = part.subplots(rows, columns, squeeze=False, **more).ravel().tolist()
-    for ax in every[count:]:
-        ax.set_axis_off()
-    return every[:count]
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from foamfit.report.plots import origin_word
 from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page, sentences, table, words
 from foamfit.report.tables import count_determined
-from foamfit.results import STATED, Fit
+from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, counted, percent, wrapped
 from foamfit.trust.covariance import RULE, WEAK
@@ -146,8 +146,7 @@ def compared(result: Fit) -> dict[str, float]:
 def conclusions(result: Fit) -> tuple[str, ...]:
     """Return sentences on the quality of the fit and on determined and undetermined parameters.
 
-    Further sentences state the effect of the ± of the TOML and, for microscale springs and
-    relaxation, the behaviour of the identified law.
+    Further sentences describe microscale springs and relaxation.
     """
     springs = _of_springs(result)
     halves = {  # half of the 95 % interval over the value
@@ -167,8 +166,6 @@ def conclusions(result: Fit) -> tuple[str, ...]:
         widths=widths[:1] + widths[1:][-1:],
         unknown=_unknown(springs, "table of parameters"),
         weakest=[] if result.insight is None else list(result.insight.weakest()[1]),
-        stated=STATED if result.budget is None else [*filter(result.budget.sources.count, STATED)],
-        moved=_moved(result),
     )
 
 
@@ -197,18 +194,6 @@ def _unknown(
         if groups:
             grouped[state] = groups
     return grouped
-
-
-def _moved(result: Fit) -> tuple[str, float] | None:
-    """Return the parameter most affected by the unfitted ± of the TOML, and its relative change."""
-    if (budget := result.budget) is None or not budget.contributions:
-        return None
-    shares = {
-        name: (result.parameters[name].systematic or 0.0) / budget.scales[name]
-        for name in budget.contributions
-    }
-    most = max(shares, key=shares.__getitem__)
-    return (most, shares[most]) if shares[most] > 0.0 else None
 
 
 def tables(result: Fit) -> dict[str, list[list[str]]]:

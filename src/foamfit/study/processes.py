@@ -28,11 +28,6 @@ from foamfit.terminal import without_ctrl_c
 # Modules that are imported by fits and by their pages.
 FITS = ("foamfit.study.batch", "foamfit.data.csv_file", "pandas", "pint")
 PAGES = ("matplotlib.backends.backend_agg", "matplotlib.backends.backend_pdf", "jinja2")
-# One thread per process, as there is one process per core.
-ONE_THREAD = {
-    f"{name}_NUM_THREADS": "1"
-    for name in ("OMP", "OPENBLAS", "MKL", "NUMBA", "NUMEXPR", "VECLIB", "BLIS")
-}
 _STARTING, _SCRIPT = threading.Lock(), ModuleType("__main__")
 
 
@@ -63,7 +58,7 @@ def context_of(preload: Iterable[str]) -> Any:
 
 
 class Processes(ThreadPoolExecutor):
-    """An executor with `count` single-threaded processes, which end with their parent process.
+    """An executor with `count` processes, which end with their parent process.
 
     A call whose process ends raises `EndedError`; other calls are not affected. Functions must be
     defined in modules. The running script is not imported again and needs no guard. For `preload`
@@ -114,20 +109,13 @@ class Processes(ThreadPoolExecutor):
 
 @contextmanager
 def _starting() -> Iterator[None]:
-    """Make processes started in the body single-threaded and not import the running script."""
+    """Keep processes started in the body from importing the running script."""
     with _STARTING:
-        script, before = sys.modules["__main__"], {n: os.environ.get(n) for n in ONE_THREAD}
-        sys.modules["__main__"] = _SCRIPT
-        os.environ.update(ONE_THREAD)
+        script, sys.modules["__main__"] = sys.modules["__main__"], _SCRIPT
         try:
             yield
         finally:
             sys.modules["__main__"] = script
-            for name, value in before.items():
-                if value is None:
-                    del os.environ[name]
-                else:
-                    os.environ[name] = value
 
 
 def _begin(stop: connection.Connection, law_files: Mapping[str, str]) -> None:

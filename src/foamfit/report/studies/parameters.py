@@ -96,7 +96,9 @@ def plot_parameters(
         if above is not None:
             top, part = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
             above(top.subplots())
-        axes = figures.grid_of(part, rows, across, n, sharey=True)
+        axes = part.subplots(rows, across, squeeze=False, sharey=True).ravel().tolist()
+        for ax in axes[n:]:
+            ax.set_axis_off()
         size = min(6.5, 0.62 * 72.0 * (tall - 0.55) / max(len(names), 1))
         for ax, panel in zip(axes, panels, strict=False):
             _draw(ax, panel, tests, (wide - margin) / across > ROOMY)
