@@ -244,8 +244,7 @@ def draw(card: Card) -> Figure:
         lines.append(Line(curves.strain[beyond], stress[beyond], "_beyond", style | {"ls": ":"}))
     panels.append(Panel("loading", *axes, lines, title="loading; dotted: extrapolated"))
     about = f"{card.name} as {card.format}", f"misfit: {', '.join(misfits)}"
-    with panelled(panels, TWO, *about) as (figure, _):
-        return figure
+    return panelled(panels, TWO, *about)
 
 
 @single_threaded

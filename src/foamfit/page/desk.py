@@ -358,8 +358,7 @@ def _picture(csv: Path, toml: Path, columns: Collection[str]) -> bytes:
         if x is not None:
             line = Line(x, test.stress, "", {"color": figures.BLUE, "lw": 0.9})
             panels.append(Panel(axis[0], axis, pushed, [line]))
-    with panelled(panels, figures.TWO) as (figure, _):
-        return figures.images(figure, "png", dpi=130)[0]
+    return figures.images(panelled(panels, figures.TWO), "png", dpi=130)[0]
 
 
 def remedies(message: str) -> dict[str, tuple[str, dict[str, Any]]]:

@@ -7,8 +7,7 @@ snapped micro-springs.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,7 +40,6 @@ MOST_WIDE = {0: 4.0, 1: 4.0, 2: 5.4, 3: 7.0}  # largest width in inches, by numb
 INSTANTS = 7  # pictures of a foam
 SNAPPED, STANDING = "#7FB2D9", "#E6EEF4"  # shades of the snapped part and of the rest of a spring
 LOOP, WIDER = 159.0, 1.45  # prescribed motion: height of the loop, its width over that of others
-Drawn = tuple["Axes", Panel, tuple[float, float]]  # axes, panel, and its size in points
 
 
 def plot_fit(result: Fit, *, width: str = TWO) -> Figure:
@@ -58,11 +56,12 @@ def plot_fit(result: Fit, *, width: str = TWO) -> Figure:
     more = [word] if word and word not in name.lower() else []
     more += [f"stopped by {result.stopped}"] if result.stopped else []
     title = " · ".join([name, result.law, f"{result.drive} drive", *more])
+
+    def add(ax: Axes, panel: Panel, size: tuple[float, float]) -> None:
+        annotate(ax, panel, result, size)
+
     known = is_known(result)
-    with panelled(panels_of(result), width, title, strips=True, known=known) as (figure, drawn):
-        for ax, panel, extent in drawn:
-            annotate(ax, panel, result, extent)
-    return figure
+    return panelled(panels_of(result), width, title, strips=True, known=known, add=add)
 
 
 def draw_panel(result: Fit, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
@@ -131,12 +130,13 @@ def plot_response(
         Panel("displacement-time", ("time", "s"), ("displacement", "m"), moving),
         Panel("stress-strain", ("overall strain", "–"), ("base stress", "Pa"), looped),
     ]
-    with panelled(panels, width) as (figure, drawn):
-        for ax, panel, _ in drawn[:2]:
-            if end is not None:
-                style: Any = {"color": GREY, "lw": 0.6, "ls": (0, (2, 2))}
-                ax.axvline(end / panel.scale()[0], label="end of contact", **style)
-    return figures.save(figure, path)
+
+    def add(ax: Axes, panel: Panel, _: object) -> None:
+        if end is not None and not panel.is_loop:
+            style: Any = {"color": GREY, "lw": 0.6, "ls": (0, (2, 2))}
+            ax.axvline(end / panel.scale()[0], label="end of contact", **style)
+
+    return figures.save(panelled(panels, width, add=add), path)
 
 
 def origin_word(result: Fit) -> str | None:
@@ -146,15 +146,19 @@ def origin_word(result: Fit) -> str | None:
     return match and {"reconstruct": "reconstruction"}.get(match[1], match[1])
 
 
-@contextmanager
 def panelled(
-    panels: list[Panel], width: str, *title: str, strips: bool = False, known: bool = False
-) -> Iterator[tuple[Figure, list[Drawn]]]:
-    """Yield a figure with its panels drawn; add a legend and place the panels at the end.
+    panels: list[Panel],
+    width: str,
+    *title: str,
+    strips: bool = False,
+    known: bool = False,
+    add: Callable[[Axes, Panel, tuple[float, float]], object] = lambda *_: None,
+) -> Figure:
+    """Draw panels with a legend below them.
 
     Strips are drawn below the panels if wanted; for a `known` motion the first panel is largest.
-    Places are given, as finding them from the sizes of all texts takes as long as drawing the
-    figure.
+    `add` draws more into a panel of a size in points. Places are given, as finding them from the
+    sizes of all texts takes as long as drawing the figure.
     """
     count = max(len(panels), 1)
     wide = min(figures.inches(width), MOST_WIDE[3 if known and count > 1 else min(len(panels), 3)])
@@ -171,7 +175,7 @@ def panelled(
         axes = [figure.add_axes((0.0, 0.0, 1.0, 1.0)) for _ in range(count)]
         if not panels:
             figures.say_nothing_there(axes[0])
-        drawn, places = list[Drawn](), list[Any]()
+        places = list[Any]()
         for i, (ax, panel) in enumerate(zip(axes, panels, strict=False)):
             (row, column), high = divmod(i, across), tall
             x, y = (column + 1) * LEFT + sum(spans[:column]), title_high + row * cell + top
@@ -183,8 +187,7 @@ def panelled(
             else:
                 high += below
             places.append((ax, x, y, spans[column], high))
-            drawn.append((ax, panel, (spans[column], high)))
-        yield figure, drawn
+            add(ax, panel, (spans[column], high))
         figures.legend_below(figure, figures.named_in(figure.axes))
         whole = 72.0 * figure.get_figheight()
         for ax, x, y, span, high in places:
@@ -193,6 +196,7 @@ def panelled(
             )
             ax.yaxis.set_label_coords(-ASIDE / span, 0.5)
             ax.xaxis.set_label_coords(0.5, -BENEATH / high)
+    return figure
 
 
 def figures_of(result: Fit, width: str = TWO) -> dict[str, Figure]:
@@ -215,8 +219,7 @@ def plot_profiles(result: Fit) -> Figure | None:
         panels.append(Panel(one.name, (name, estimate.unit), ("rise of χ²", ""), lines))
     if not panels:
         return None
-    with panelled(panels, TWO) as (figure, _):
-        return figure
+    return panelled(panels, TWO)
 
 
 def _profile_lines(profile: Profile, stderr: float | None) -> list[Line]:

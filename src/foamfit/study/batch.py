@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent import futures
 from concurrent.futures import Executor, Future
-from contextlib import chdir, nullcontext, suppress
+from contextlib import chdir, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
@@ -253,9 +253,13 @@ def batch(
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {reason(error)}") from None
     try:
-        given = None if executor is None else nullcontext(executor)
-        with given or _processes(recipe, jobs, len(found)) as runner:
-            made.fit(runner)
+        if executor is not None:
+            made.fit(executor)
+        else:
+            precompile.compile_solver(named)
+            imported = FITS + (PAGES if report else ())
+            with Processes(min(jobs or cores(), len(found)), imported) as processes:
+                made.fit(processes)
     finally:  # a process that was killed may have left half a folder
         sweep(folder.resolve(), [name for name, _ in found])
     return tables.read_table(folder / "summary.csv")
@@ -271,11 +275,6 @@ def _checked(model: str, options: Options) -> str:
     names = (*read.names, *nuisance.names_of(drive, time_shift=True))
     check_fixed_and_varied(names, read.name, options.fix or {}, options.vary)
     return read.name
-
-
-def _processes(recipe: Recipe, jobs: int | None, tests: int) -> Processes:
-    precompile.compile_solver(recipe.model)
-    return Processes(min(jobs or cores(), tests), (*FITS, *(PAGES if recipe.pages else ())))
 
 
 @dataclass(frozen=True)

@@ -334,7 +334,19 @@ def result_of(
         parameters=parameters,
         covariance={"names": fit.point.names, "matrix": _common_covariance(fit)},
         specimens={"names": fit.correlation[0], "correlation": fit.correlation[1]},
-        statistics=_statistics(fit, alone),
+        statistics={
+            "n_tests": len(found.problems),
+            "n_data": found.n_data,
+            "n_vary": found.n_vary,
+            "chisqr": found.cost,
+            "redchi": found.cost / max(found.n_data - found.n_vary, 1),
+            "n_effective": fit.point.uncertainty.covariance.effective,
+            "n_eff": alone.n_eff,
+            "bic": found.bic(alone.n_eff),
+            "bic_alone": alone.bic(alone.n_eff),
+            "n_vary_alone": alone.n_vary,
+            "chisqr_alone": alone.cost,
+        },
         loops=tuple(loops),
         fits=tuple(fits),
         fit=fit,
@@ -359,23 +371,6 @@ def _estimates(
             why = "held fixed" if param.expr is None else f"tied by {param.expr}"
             out[name] = ParameterEstimate(value, None, None, one.unit, False, "fixed", why)
     return out
-
-
-def _statistics(fit: JointFit, alone: Together) -> dict[str, float | int]:
-    found = fit.found
-    return {
-        "n_tests": len(found.problems),
-        "n_data": found.n_data,
-        "n_vary": found.n_vary,
-        "chisqr": found.cost,
-        "redchi": found.cost / max(found.n_data - found.n_vary, 1),
-        "n_effective": fit.point.uncertainty.covariance.effective,
-        "n_eff": alone.n_eff,
-        "bic": found.bic(alone.n_eff),
-        "bic_alone": alone.bic(alone.n_eff),
-        "n_vary_alone": alone.n_vary,
-        "chisqr_alone": alone.cost,
-    }
 
 
 def _common_covariance(fit: JointFit) -> Array:

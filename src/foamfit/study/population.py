@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Specimen
@@ -82,15 +81,16 @@ class Population:
         """
         free = [name for name in self._uncertain if name not in self.held]
         free += [f"{name}:b" for name, one in self._parameters.items() if one.b_stderr]
-        at, places = _places(free, self.source.names)
-        held = _places(self.held, self.source.names)[1]
+        _, at, places = np.intersect1d(free, self.source.names, return_indices=True)
+        held = np.intersect1d(self.held, self.source.names, return_indices=True)[2]
         r, matrix = self.source.correlation, np.eye(len(free))
         inner, across = r[np.ix_(places, places)], r[np.ix_(places, held)]
         if held.size:
             inverse = np.linalg.pinv(r[np.ix_(held, held)], hermitian=True)
             inner = inner - across @ inverse @ across.T
         matrix[np.ix_(at, at)] = inner
-        at, places = _places(free, self.scattering)  # their common values
+        # Their common values
+        _, at, places = np.intersect1d(free, self.scattering, return_indices=True)
         matrix[np.ix_(at, at)] = self._correlation[np.ix_(places, places)]
         errors = np.array([self._error(name) for name in free])
         matrix = matrix * np.outer(errors, errors)
@@ -164,11 +164,11 @@ class Population:
         """Correlation of the scattering parameters between specimens."""
         names, own = self.scattering, self._own
         out = np.eye(len(names))
-        at, places = _places(names, self.source.changing)
+        _, at, places = np.intersect1d(names, self.source.changing, return_indices=True)
         out[np.ix_(at, at)] = self.source.together[np.ix_(places, places)]
         # For own parameters with a trend, or missing in the result, from their deviations.
         if own.slopes.any() or not set(own.names) <= set(self.source.changing):
-            at, places = _places(names, own.names)
+            _, at, places = np.intersect1d(names, own.names, return_indices=True)
             among_own = correlation(own.deviations, np.zeros((places.size, places.size)))
             out[np.ix_(at, at)] = among_own[np.ix_(places, places)]
         return out
@@ -300,15 +300,6 @@ class _Own(NamedTuple):
     slopes: Array  # (k,): by the logarithm of the rate; 0 without evidence for a trend
     deviations: Array  # (n, k): of the tests from the means
     spread: Array  # (k,): standard deviation of a new specimen from the mean, as estimated
-
-
-def _places(
-    names: tuple[str, ...] | list[str], among: tuple[str, ...]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices of the names that occur in `among`, and their indices in `among`."""
-    pairs = [(i, among.index(name)) for i, name in enumerate(names) if name in among]
-    at, places = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
-    return at, places
 
 
 def _root(correlation: Array) -> Array:

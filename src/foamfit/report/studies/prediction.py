@@ -209,8 +209,7 @@ def plot_prediction(found: Prediction, *, width: str = TWO) -> Figure:
     about = f"{found.measurement.name}, predicted from {found.source}"
     title = f"{about}; {words('rates', found=found)}", f"inside the 95 % band: {inside}"
     known = found.drive == "displacement"
-    with panelled(_panels(found), width, *title, strips=True, known=known) as (figure, _):
-        return figure
+    return panelled(_panels(found), width, *title, strips=True, known=known)
 
 
 def _panels(found: Prediction) -> list[Panel]:
