@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import functools
 import gc
 import os
 import signal
@@ -48,7 +47,8 @@ class _Group(click.Group):
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         kwargs["standalone_mode"] = False
-        _spare_the_collector()
+        gc.set_threshold(100_000, 20, 10)  # imported objects took it a quarter of a fit
+        atexit.register(gc.freeze)
         show_all()
         try:
             with ending_cleanly(), as_signalled():
@@ -69,13 +69,6 @@ class _Group(click.Group):
             told = f"({type(error).__name__}: {error}); FOAMFIT_TRACEBACK=1 shows where it is"
             _leave(DEFECT, f"this is a defect of foamfit, please report it {told}")
         sys.exit(code if isinstance(code, int) else 0)
-
-
-@functools.cache
-def _spare_the_collector() -> None:
-    """Make the garbage collector run less often: imported objects took it a quarter of a fit."""
-    gc.set_threshold(100_000, 20, 10)
-    atexit.register(gc.freeze)
 
 
 def _leave(code: int, message: str, lines: Sequence[str] = ()) -> NoReturn:
