@@ -10,7 +10,6 @@ import hashlib
 import json
 import platform
 import threading
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent import futures
 from concurrent.futures import Executor, Future
@@ -51,7 +50,6 @@ from foamfit.text import counted
 if TYPE_CHECKING:
     import pandas as pd
 
-PAUSE = 60.0  # least time between two summaries, s: of many tests, one takes seconds
 VERSION = version("foamfit")
 RECORD = "batch.json"  # in the folder of each test: its rows, and the fingerprint of their inputs
 # One fit at a time per process, also in an executor with threads: drawing is not thread-safe.
@@ -74,7 +72,6 @@ class Batch:
     waiting: dict[Future[tuple[Row, ...]], Task] = field(default_factory=dict)
     fitted: int = 0  # number of tests fitted in this call
     wrong: int = 0  # number of finished tests without an acceptable fit
-    saved: float = field(default_factory=lambda: time.monotonic())  # time of the last summary
 
     @property
     def summary(self) -> list[Row]:
@@ -155,9 +152,6 @@ class Batch:
         self.rows[name] = rows
         self.wrong += not all(row.has_fit for row in rows)
         self.progress(self)
-        if time.monotonic() - self.saved >= PAUSE:
-            self.save()
-            self.saved = time.monotonic()
 
 
 def batch(
