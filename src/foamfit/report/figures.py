@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -162,28 +162,11 @@ def _file(figure: Figure, form: Format, dpi: int) -> bytes:
     # Without a date the same fit gives the same file.
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(form)
     more: Any = {"pil_kwargs": {"compress_level": 3}} if form == "png" else {}  # twice as fast
-    with _small_fonts() if form == "pdf" else nullcontext():
-        figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata, **more)
+    figure.savefig(buffer, format=form, dpi=dpi, metadata=metadata, **more)
     if form != "svg":
         return buffer.getvalue()
     # Verdana has nearly the same widths, where a browser lacks the font.
     return buffer.getvalue().replace(b"'DejaVu Sans'", b"'DejaVu Sans', Verdana, sans-serif")
-
-
-@contextmanager
-def _small_fonts() -> Iterator[None]:
-    """Embed fonts without tables of ligatures and kerning, which take longest to write.
-
-    A PDF has its own places of glyphs, and matplotlib no option for these tables.
-    """
-    from fontTools.subset import Options
-
-    before = Options._drop_tables_default
-    Options._drop_tables_default = [*before, "GDEF", "GPOS", "GSUB"]
-    try:
-        yield
-    finally:
-        Options._drop_tables_default = before
 
 
 def limits(values: Sequence[float], ends: Sequence[float]) -> tuple[float, float]:
