@@ -260,7 +260,7 @@ def test_a_value_far_outside_that_fits_almost_as_well_is_named(far):
 class _Interrupting(Tracker):
     """A tracker that raises Ctrl-C after a given number of evaluations."""
 
-    left = 100
+    left = 60
 
     def residual(self, values: np.ndarray) -> np.ndarray:
         self.left -= 1

@@ -130,16 +130,6 @@ class _Side:
         """Return the root of the rise over that of the cut; it is linear along a parabola."""
         return math.sqrt(max(self.rise(at), 0.0)) / self.quantile
 
-    def slope(self, at: Iterate) -> float:
-        """Return the outward derivative of the root along the profile, 1/SI.
-
-        The other parameters do not change the cost to first order.
-        """
-        root, slope = self.root(at), self.sign * float(at.gradient[self.refit.held][0])
-        if root < 1e-6:
-            return 1.0 / self.half
-        return slope / (root * self.quantile**2 * float(self.inflation))
-
     @property
     def better(self) -> bool:
         """Whether a point of clearly lower cost than the best one was found."""
@@ -154,24 +144,15 @@ class _Side:
         last = max(i for i, at in enumerate(self.refits) if self.root(at) < 1.0)
         return self.refits[last], min(self.refits[last + 1 :], key=self.root, default=None)
 
-    def parabola(self) -> float | None:
-        """Return the crossing by Newton's method if the only refit is near it, else None."""
-        at, slope = self.refits[-1], self.slope(self.refits[-1])
-        if len(self.refits) != 2 or abs(self.root(at) - 1.0) > PARABOLA or slope <= 0.0:
-            return None
-        return self._ahead(at, (1.0 - self.root(at)) / slope)
+    @property
+    def parabola(self) -> bool:
+        """Whether the only refit is near the cut, as along a parabola."""
+        return len(self.refits) == 2 and abs(self.root(self.refits[-1]) - 1.0) <= PARABOLA
 
     def crossing(self, inner: Iterate, outer: Iterate) -> float:
-        """Return the value at which the root of the rise crosses the cut.
-
-        It is that of the cubic through both roots with their slopes, or else of the line.
-        """
-        width, y0, y1 = self.value(outer) - self.value(inner), self.root(inner), self.root(outer)
-        a, b = (self.slope(at) * abs(width) for at in (inner, outer))
-        roots = np.roots([a + b - 2.0 * (y1 - y0), 3.0 * (y1 - y0) - 2.0 * a - b, a, y0 - 1.0])
-        inside = roots.real[(abs(roots.imag) < 1e-9) & (roots.real >= 0.0) & (roots.real <= 1.0)]
-        share = float(inside[0]) if inside.size == 1 else (1.0 - y0) / (y1 - y0)
-        return self.value(inner) + share * width
+        """Return the value at which a line through the roots of two refits crosses the cut."""
+        (low, high), (x, y) = map(self.root, (inner, outer)), map(self.value, (inner, outer))
+        return x + (1.0 - low) / (high - low) * (y - x)
 
     @property
     def bound(self) -> float:
@@ -180,50 +161,46 @@ class _Side:
         The local end if there is no refit.
         """
         if len(self.refits) == 1:
-            return self._ahead(self.refits[0], self.half)
-        if (end := self.parabola()) is not None:
-            return end
+            return self._within(self.value(self.refits[0]) + self.sign * self.half)
+        if self.parabola:
+            return self._within(self.crossing(*self.refits))
         inner, outer = self.bracket
         return self.limit if outer is None else self.crossing(inner, outer)
 
     def follow(self) -> None:
         """Go outward until well beyond the cut, and place the crossing."""
         self._go_outward()
-        for _ in range(INWARD if self.parabola() is None else 0):
+        for _ in range(0 if self.parabola else INWARD):
             inner, outer = self.bracket
             if outer is None or self.better:
                 break
-            value = self.crossing(inner, outer)
-            near = min(inner, outer, key=lambda at: abs(self.root(at) - 1.0))
-            if abs(self.root(near) - 1.0) <= PLACED or not (found := self.refit.hold(near, value)):
+            near = min(abs(self.root(at) - 1.0) for at in (inner, outer))
+            found = None if near <= PLACED else self.refit.hold(inner, self.crossing(inner, outer))
+            if found is None:
                 break
             self.refits.append(found)
             self.refits.sort(key=lambda at: self.sign * self.value(at))
 
     def _go_outward(self) -> None:
-        origin, step, refused = self.refit.origin, self.half, 0
-        start = self.refit.shifted(origin, self._ahead(origin, step))
-        if start is None or self.root(start) > ASTRAY:
-            step *= STEP
+        step, refused = self.half, 0
         for _ in range(OUTWARD):
             last = self.refits[-1]
             if self.value(last) == self.limit or refused > 3:
                 break
-            found = self.refit.hold(last, self._ahead(last, step))
+            found = self.refit.hold(last, self._within(self.value(last) + self.sign * step))
             if found is None:
                 step, refused = 0.3 * step, refused + 1
                 continue
             self.refits.append(found)
-            if self.root(found) >= BEYOND or self.better or self.parabola() is not None:
+            if self.root(found) >= BEYOND or self.better or self.parabola:
                 break
             if step == self.half:
                 step *= STEP
             if self.root(found) - self.root(last) < HARDLY:
                 step *= GROWTH
 
-    def _ahead(self, at: Iterate, step: float) -> float:
-        """Return the value a step outward, not beyond the limit."""
-        value = self.value(at) + self.sign * step
+    def _within(self, value: float) -> float:
+        """Return a value, or the limit if it lies beyond."""
         return self.limit if self.sign * (value - self.limit) > 0.0 else value
 
 
