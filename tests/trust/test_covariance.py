@@ -64,7 +64,7 @@ def test_an_error_of_a_held_parameter_is_added():
     residual = rng.standard_normal(n)
     residual -= residual.mean()
     mean, noise = np.ones((n, 1)), NoiseProcess(np.zeros(0), 1.0)
-    block = Block(mean, residual, (n,), [noise], np.eye(1), shifts=np.full((n, 1), off))
+    block = Block(mean, (n,), [noise], np.eye(1), shifts=np.full((n, 1), off))
     found = Uncertainty((block,), np.ones(1)).covariance
     assert found.stderr[0] == pytest.approx(np.hypot(1.0 / np.sqrt(n), off), rel=1e-3)
 
@@ -73,8 +73,8 @@ def test_the_curvature_is_that_at_the_bottom_of_a_curved_valley():
     """One standard error away the fourth-order term is up to 400 times as large."""
     hessian, steep = np.array([[1.5, 0.2], [0.2, 0.8]]), np.array([2.0, -4.0])
     block = Block(
-        np.eye(9, 2), np.zeros(9), (9,), [NoiseProcess(np.zeros(0), 1.0)], np.eye(2),
-        lambda places, step: (hessian @ step + (steep @ step) ** 3 * steep)[places],
+        np.eye(9, 2), (9,), [NoiseProcess(np.zeros(0), 1.0)], np.eye(2),
+        lambda step: hessian @ step + (steep @ step) ** 3 * steep,
     )  # fmt: skip
     found = block.curvature(np.eye(2))
     assert np.linalg.eigvalsh(found) == pytest.approx(np.linalg.eigvalsh(hessian), rel=0.02)

@@ -113,15 +113,11 @@ def test_the_curvature_that_a_residual_leaves_is_in_the_covariance():
     best = least_squares(residual, [0.8], jac=slopes, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
     left, jacobian = residual(best), slopes(best)
     white = [NoiseProcess(np.empty(0), 1e-4)] * 2
-    one = Uncertainty(
-        (
-            Block(
-                jacobian, left, (400, 400), white, np.eye(1),
-                lambda _, step: slopes(best + step).T @ residual(best + step),
-            ),
-        ),
-        np.ones(1),
+    block = Block(
+        jacobian, (400, 400), white, np.eye(1),
+        lambda step: slopes(best + step).T @ residual(best + step),
     )  # fmt: skip
+    one = Uncertainty((block,), np.ones(1))
     found, plain = one.bent.sandwich, one.sandwich
     square = float(np.sum(jacobian**2))
     curvature = square + 2.0 * float(t @ left[:400])

@@ -173,9 +173,8 @@ class BestPoint:
         """Return the block of this test in a covariance; `errors` are those of its curves."""
         noise, through = [error.noise for error in errors], np.eye(self.sizes.size)
         return Block(
-            self.scaled, self.residual, self.problem.objective.sizes, noise, through,
+            self.scaled, self.problem.objective.sizes, noise, through,
             gradient=self.gradient if any(error.found for error in errors) else None,
-            room=(np.abs(self.box - self.values[self.places]) / self.sizes).T,
             shifts=self.shifts if self.problem.kept else None,
             of_priors=self.problem.objective.unit**2,
         )  # fmt: skip
@@ -199,15 +198,14 @@ class BestPoint:
             out[force] = error * self.problem.slopes(self.values, (force,))[:, 0]
         return np.reshape([*out.values()], (-1, self.residual.size)).T
 
-    def gradient(self, places: NDArray[np.intp], step: Array) -> Array:
-        """Return half the gradient of the cost after a step of the parameters at `places`.
+    def gradient(self, step: Array) -> Array:
+        """Return half the gradient of the cost after a step of the k parameters.
 
         Step and gradient are scaled; the step is cut at the limits of the parameters.
         """
-        at, sizes, (low, high) = self.places[places], self.sizes[places], self.box[:, places]
         values = self.values.copy()
-        values[at] = np.clip(values[at] + step * sizes, low, high)
-        slopes = self.problem.slopes(values, tuple(self.names[i] for i in places)) * sizes
+        values[self.places] = np.clip(values[self.places] + step * self.sizes, *self.box)
+        slopes = self.problem.slopes(values, self.names) * self.sizes
         return np.asarray(slopes.T @ self.problem.objective.residual(values))
 
     @cached_property
@@ -230,6 +228,13 @@ class BestPoint:
         """Parameters that are determined or weak by their local interval."""
         known = np.flatnonzero(self.halves <= covariance.NOTHING * self.sizes)
         return [self.names[i] for i in known]
+
+    def answer(self, change: Array) -> Array:
+        """Return the steps (k, q), SI, of the k parameters after changes (n_data, q) of `residual`.
+
+        They are Gauss-Newton steps, zero along directions that the curves do not determine.
+        """
+        return -self.sizes[:, None] * (np.linalg.pinv(self.scaled, rcond=1e-10) @ change)
 
     def added(self, curve: str, values: Array) -> Array:
         """Return the change of the residual by `values` added to a simulated curve, (n_data,)."""

@@ -51,7 +51,6 @@ class Covariance:
     inflation: Array
     freedom: Array  # (k,): degrees of freedom: effective samples less the number of parameters
     effective: float  # effective number of samples
-    noise: tuple[NoiseProcess, ...]  # noise of each curve, in units of the residual
 
     @property
     def stderr(self) -> Array:
@@ -87,18 +86,16 @@ class Block:
     """
 
     jacobian: Array  # (n, k): derivatives of the residuals of its curves in turn, then of priors
-    residual: Array  # (n,)
-    sizes: tuple[int, ...]  # samples of each curve; the remaining rows are priors of unit variance
+    sizes: tuple[int, ...]  # samples of each curve; the remaining rows are priors
     noise: Sequence[NoiseProcess]  # of each curve
     through: Array  # (k, m): derivatives of its parameters by the unknowns
-    # Jᵀr for some parameters (by place) after a step of these from the best point; None where the
-    # residual is noise only, so that the curvature is JᵀJ.
-    gradient: Callable[[NDArray[np.intp], Array], Array] | None = None
-    room: Array | None = None  # (k, 2): distances to the lower and upper limits
+    # Jᵀr after a step from the best point; None where the residual is noise only, so that the
+    # curvature is JᵀJ.
+    gradient: Callable[[Array], Array] | None = None
     # (n, q): change of the residual by one standard error of each quantity that the fit takes as
     # exact, like a parameter held where the record shows it
     shifts: Array | None = None
-    of_priors: float = 1.0  # variance of the residuals of priors
+    of_priors: float | Array = 1.0  # variance of the remaining residuals
 
     @cached_property
     def axes(self) -> tuple[Array, Array]:
@@ -117,18 +114,7 @@ class Block:
         """Covariance of the noise along the orthonormal columns, (r, r)."""
         rest = self.axes[0][sum(self.sizes) :]
         inner = sum(left.T @ one.times(left) for one, left in self.curves)
-        return np.asarray(inner + self.of_priors * (rest.T @ rest))
-
-    def without(self, held: NDArray[np.bool_]) -> Block:
-        """Return the block with some of the unknowns fixed."""
-        rows = np.flatnonzero(~(self.through[:, held] != 0.0).any(axis=1))
-        full = self.gradient
-        return replace(
-            self,
-            jacobian=self.jacobian[:, rows],
-            through=self.through[np.ix_(rows, ~held)],
-            gradient=full and (lambda places, step: full(rows[places], step)),
-        )
+        return np.asarray(inner + rest.T @ (np.reshape(self.of_priors, (-1, 1)) * rest))
 
     def curvature(self, spread: Array) -> Array:
         """Return the curvature of half the cost along the orthonormal columns, (r, r).
@@ -152,10 +138,10 @@ class Block:
     def _bent(self, axes: Array, part: float) -> Array:
         """Return the changes of the gradient along each axis per `part` of its length, (r, r)."""
         assert self.gradient is not None
-        every, rows = np.arange(self.jacobian.shape[1]), self.axes[1]
+        rows = self.axes[1]
         unit_steps = rows.T / np.sum(rows**2, axis=1)
         steps = part * (unit_steps @ axes).T
-        change = [self.gradient(every, step) - self.gradient(every, -step) for step in steps]
+        change = [self.gradient(step) - self.gradient(-step) for step in steps]
         return np.asarray(np.array(change) @ unit_steps / (2.0 * part))
 
 
@@ -164,30 +150,26 @@ class Uncertainty:
     """Uncertainty of m unknowns due to noise at the best point of one test or several.
 
     The scaled covariance is H⁻¹ JᵀΣJ H⁻¹, with Σ the noise covariance of the curves of all tests.
-    H is JᵀJ or, with `curvatures` (of each test, along its `Block.axes`), the Hessian of half the
-    cost, which differs from JᵀJ if there is model error (White 1982, Econometrica 50, 1). `drawn`
-    contains the derivatives (d, m) and variances (d,) of additional residuals. All is computed
-    along s directions of the unknowns, along which the residuals of all tests together have unit
-    slopes.
+    H is JᵀJ or, with `curvatures` (of each block, along its `Block.axes`), the Hessian of half the
+    cost, which differs from JᵀJ if there is model error (White 1982, Econometrica 50, 1). A block
+    without curves has residuals that belong to no test. All is computed along s directions of the
+    unknowns, along which all residuals together have unit slopes.
     """
 
     blocks: tuple[Block, ...]
     scales: Array  # (m,)
-    drawn: tuple[Array, Array] | None = None
     curvatures: tuple[Array, ...] | None = None
 
     def __post_init__(self) -> None:
         """Solve for the directions.
 
         `root` (m, s) contains the steps of the unknowns that are unit steps along the directions,
-        `lefts` the components of these along each test's orthonormal columns, then `drawn`; `lost`
-        (m,) are the unknowns that the tests do not determine, and `errs` is whether a test has
-        model error.
+        `lefts` the components of these along each block's orthonormal columns; `lost` (m,) are the
+        unknowns that the tests do not determine, and `errs` is whether a test has model error.
         """
         rows = [block.axes[1] @ block.through for block in self.blocks]
-        rows += [] if self.drawn is None else [self.drawn[0]]
-        self._left, singular, vt = _directions(np.concatenate(rows))
-        self.lefts = np.split(self._left, np.cumsum([len(row) for row in rows[:-1]]))
+        every, singular, vt = _directions(np.concatenate(rows))
+        self.lefts = np.split(every, np.cumsum([len(row) for row in rows[:-1]]))
         self.root = vt.T / singular
         along = self.root / np.maximum(np.linalg.norm(self.root, axis=0), 1e-300)
         self.lost: NDArray[np.bool_] = np.sum(along**2, axis=1) < 1.0 - 1e-6
@@ -196,19 +178,16 @@ class Uncertainty:
     @cached_property
     def axes(self) -> Array:
         """Principal axes of the covariance of the noise, one standard deviation long, (s, s)."""
-        rows = [block.meat @ left for left, block in zip(self.lefts, self.blocks, strict=False)]
-        rows += [] if self.drawn is None else [self.drawn[1][:, None] * self.lefts[-1]]
-        return _principal(self._left.T @ np.concatenate(rows))
+        pairs = zip(self.lefts, self.blocks, strict=True)
+        return _principal(np.asarray(sum(left.T @ block.meat @ left for left, block in pairs)))
 
     @cached_property
     def _bread(self) -> Array:
         """H⁻¹ along the directions; that of JᵀJ without curvature."""
-        out = np.eye(self.root.shape[1])
         if self.curvatures is None:
-            return out
-        pairs = zip(self.lefts, self.curvatures, strict=False)
-        more = np.concatenate([(curved - np.eye(len(curved))) @ left for left, curved in pairs])
-        out += self._left[: len(more)].T @ more
+            return np.eye(self.root.shape[1])
+        pairs = zip(self.lefts, self.curvatures, strict=True)
+        out = np.asarray(sum(left.T @ curved @ left for left, curved in pairs))
         values, vectors = np.linalg.eigh(0.5 * (out + out.T))
         return np.asarray((vectors / np.maximum(values, FLATTEST)) @ vectors.T)
 
@@ -222,7 +201,7 @@ class Uncertainty:
         """Covariance of the scaled unknowns, (m, m); NaN for undetermined ones."""
         spread = self.root @ self._bread @ self.axes
         out = spread @ spread.T
-        for left, block in zip(self.lefts, self.blocks, strict=False):
+        for left, block in zip(self.lefts, self.blocks, strict=True):
             if block.shifts is not None:
                 # So far away the curvature of a cost with kinks is unknown, and JᵀJ is used.
                 pulls = self.root @ left.T @ (block.axes[0].T @ block.shifts)
@@ -231,36 +210,18 @@ class Uncertainty:
         return out
 
     @cached_property
-    def held(self) -> NDArray[np.bool_]:
-        """Unknowns that the residuals press against a limit more than noise could, (m,)."""
-        pull, variance = np.zeros((2, self.scales.size))
-        near = np.zeros((2, self.scales.size), dtype=bool)
-        for block in self.blocks:
-            slopes = block.axes[1] @ block.through
-            pull += block.through.T @ (block.jacobian.T @ block.residual)
-            variance += np.einsum("ij,ij->j", slopes, block.meat @ slopes)
-            if block.room is not None:
-                near |= (block.room.T <= AT_LIMIT) @ (block.through != 0.0)
-        outward = np.where(near[0], pull, np.where(near[1], -pull, 0.0))
-        return np.asarray(outward > 1.96 * np.sqrt(variance))
-
-    @cached_property
     def bent(self) -> Uncertainty:
-        """The same with the curvature of the cost of each test, and without unknowns in `held`."""
-        free, reduced = ~self.held, self
-        if not free.all():
-            blocks = tuple(block.without(self.held) for block in self.blocks)
-            drawn = None if self.drawn is None else (self.drawn[0][:, free], self.drawn[1])
-            reduced = Uncertainty(blocks, self.scales[free], drawn)
-        spreads = [left @ reduced.axes for left in reduced.lefts]
-        pairs = zip(reduced.blocks, spreads, strict=False)
-        return replace(reduced, curvatures=tuple(block.curvature(s @ s.T) for block, s in pairs))
+        """The same with the curvature of the cost of each test."""
+        spreads = [left @ self.axes for left in self.lefts]
+        pairs = zip(self.blocks, spreads, strict=True)
+        return replace(self, curvatures=tuple(block.curvature(s @ s.T) for block, s in pairs))
 
     @cached_property
     def sandwich(self) -> Covariance:
         """Covariance, SI, with H as it is here."""
-        effective = [sum(len(x) / one.tau for one, x in block.curves) for block in self.blocks]
-        used = np.array([(block.through != 0.0).any(axis=0) for block in self.blocks])
+        tests = [block for block in self.blocks if block.sizes]
+        effective = [sum(len(x) / one.tau for one, x in block.curves) for block in tests]
+        used = np.array([(block.through != 0.0).any(axis=0) for block in tests])
         freedom = np.full(self.scales.size, sum(effective) - self.scales.size)
         for own, count in zip(used & (used.sum(axis=0) == 1), effective, strict=True):
             freedom[own] = count - np.count_nonzero(own)
@@ -269,7 +230,6 @@ class Uncertainty:
             np.diag(self.matrix) / np.where(self.lost, np.nan, np.diag(self.inverse)),
             np.maximum(freedom, 1.0),
             float(sum(effective)),
-            tuple(process for block in self.blocks for process in block.noise),
         )
 
     @cached_property
@@ -277,17 +237,15 @@ class Uncertainty:
         """Covariance of the unknowns, SI, with the curvature of the cost if there is model error.
 
         The curvature of a cost with kinks is only roughly known, so it does not reduce any
-        variance. Unknowns in `held` are uncorrelated with the others.
+        variance.
         """
         plain = self.sandwich
-        if not self.errs or self.held.all():
+        if not self.errs:
             return plain
-        free, bent, variance = np.flatnonzero(~self.held), self.bent.sandwich, np.diag(plain.matrix)
-        more = np.sqrt(np.fmax(variance[free] / np.diag(bent.matrix), 1.0))
-        matrix, inflation, freedom = np.diag(variance), plain.inflation.copy(), plain.freedom.copy()
-        matrix[np.ix_(free, free)] = bent.matrix * np.outer(more, more)
-        inflation[free], freedom[free] = bent.inflation * more**2, bent.freedom
-        return replace(plain, matrix=matrix, inflation=inflation, freedom=freedom)
+        bent = self.bent.sandwich
+        more = np.sqrt(np.fmax(np.diag(plain.matrix) / np.diag(bent.matrix), 1.0))
+        matrix, inflation = bent.matrix * np.outer(more, more), bent.inflation * more**2
+        return replace(bent, matrix=matrix, inflation=inflation)
 
 
 def covariance(
@@ -301,7 +259,7 @@ def covariance(
     """
     scaled = jacobian * scales
     noise = noise_processes(residual, scaled, sizes)
-    block = Block(scaled, residual, sizes, noise, np.eye(scales.size), of_priors=of_priors)
+    block = Block(scaled, sizes, noise, np.eye(scales.size), of_priors=of_priors)
     return Uncertainty((block,), scales).covariance
 
 

@@ -139,9 +139,9 @@ def look(best: BestPoint) -> Insight:
     problem, objective, k = best.problem, best.problem.objective, len(best.names)
     labels = np.array(sections(problem, best.simulated))
     parts, triangles = list[tuple[str, str]](), list[Array]()
-    pairs = zip(objective.by_curve(best.scaled).items(), best.spread.noise, strict=True)
-    for (curve, slopes), noise in pairs:
-        rows = slopes / math.sqrt(max(noise.variance * noise.tau, 1e-300))
+    pairs = zip(objective.by_curve(best.scaled).items(), best.errors, strict=True)
+    for (curve, slopes), error in pairs:
+        rows = slopes / math.sqrt(max(error.noise.variance * error.noise.tau, 1e-300))
         for label in dict.fromkeys(labels.tolist()):
             triangle = np.linalg.qr(rows[labels[objective.kept[curve]] == label], mode="r")
             parts.append((curve, label))

@@ -199,9 +199,9 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
     """
     if best.misfits:
         apart, objective = residual - best.residual, best.problem.objective
-        pairs = zip(best.spread.noise, objective.by_curve(apart).values(), strict=True)
+        pairs = zip(best.errors, objective.by_curve(apart).values(), strict=True)
         spread = objective.unit**2 * float(np.sum(apart[objective.n_data :] ** 2))  # of priors
-        spread += sum(float(own @ process.times(own)) for process, own in pairs)
+        spread += sum(float(own @ error.noise.times(own)) for error, own in pairs)
         near = float(residual @ residual) - best.cost <= 1.96 * 2.0 * math.sqrt(spread)
         return best.halves if near else np.full(best.halves.shape, np.nan)
     left = 1.0 - best.rises(residual) / best.quantiles**2
@@ -250,9 +250,9 @@ def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
         return Intervals(warnings=(note,))
     drawn = chain.samples
     if best.problem.kept:  # contact and zeros that are held are off by their errors, first order
-        moves = best.sizes[:, None] * (np.linalg.pinv(best.scaled, rcond=1e-10) @ best.shifts)
-        off = np.random.default_rng([choice.seed, 4]).standard_normal((len(drawn), moves.shape[1]))
-        drawn = np.clip(drawn - off @ moves.T, *best.box)
+        steps = best.answer(best.shifts)
+        off = np.random.default_rng([choice.seed, 4]).standard_normal((len(drawn), steps.shape[1]))
+        drawn = np.clip(drawn + off @ steps.T, *best.box)
     low, high = np.percentile(drawn, [2.5, 97.5], axis=0).tolist()
     pairs = zip(best.names, low, high, strict=True)
     ends = {name: (a, b) for name, a, b in pairs if name in best.known}
@@ -323,7 +323,7 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     objective = best.problem.objective
     tracker = Tracker(objective) if tracker is None else tracker
     (low, high), complete = best.box, best.problem.space().complete
-    variances = [process.variance * process.tau for process in best.spread.noise]
+    variances = [error.noise.variance * error.noise.tau for error in best.errors]
     weights = np.repeat(1.0 / np.array(variances), objective.sizes)
     weights = np.append(weights, np.full(len(objective.priors), objective.unit**-2))
 

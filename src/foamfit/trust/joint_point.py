@@ -94,15 +94,15 @@ class JointPoint:
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """Uncertainty of all unknowns due to noise."""
-        blocks = tuple(map(self._block, range(len(self.bests))))
-        return Uncertainty(blocks, self._scales, self._drawn())
+        blocks = (*map(self._block, range(len(self.bests))), *self._drawn())
+        return Uncertainty(blocks, self._scales)
 
     def _block(self, t: int) -> Block:
         """Return the block of a test."""
         best, links = self.bests[t], self.found.links
         block = best.block(self.errors[t] if self.errors else ())
         places = {name: i for i, name in enumerate(self.names)} | self._own[t]
-        through, room = np.zeros((len(best.names), self._scales.size)), np.array(block.room)
+        through = np.zeros((len(best.names), self._scales.size))
         for i, name in enumerate(best.names):
             at, kind = places[name], links.kind(name)
             through[i, at] = 1.0
@@ -110,12 +110,10 @@ class JointPoint:
                 v, b = self.found.common[name]
                 f, slope = factor(kind, b, links.x(t))
                 through[i, at : at + 2] = f, v * slope
-            if kind not in ("own", "shared"):
-                room[i] = np.inf
-        return replace(block, through=through * self._scales / best.sizes[:, None], room=room)
+        return replace(block, through=through * self._scales / best.sizes[:, None])
 
-    def _drawn(self) -> tuple[Array, Array] | None:
-        """Return the slopes and variances of the residuals that draw values to a common one."""
+    def _drawn(self) -> list[Block]:
+        """Return a block of the residuals that draw values to a common one, if there are any."""
         rows, variances = list[Array](), list[float]()
         for name, pulls in self.found.links.pulls.items():
             for t, (best, own) in enumerate(zip(self.bests, self._own, strict=True)):
@@ -126,7 +124,10 @@ class JointPoint:
                 row[self.names.index(name)] = -1.0
                 rows.append(row * pulls[t])
                 variances.append(float(self.inflations[name][t]) if self.inflations else 1.0)
-        return (np.array(rows), np.array(variances)) if rows else None
+        through = np.eye(self._scales.size)
+        return (
+            [Block(np.array(rows), (), (), through, of_priors=np.array(variances))] if rows else []
+        )
 
     def of_common(self, name: str) -> Error:
         """Return the error of a common unknown; NaN for others."""
@@ -200,14 +201,10 @@ class JointPoint:
     @cached_property
     def _undrawn(self) -> tuple[Array, Array]:
         """Covariance and inverse curvature without the pull to common values, SI, (m, m) each."""
-        full = self.uncertainty
-        held = full.held if full.errs else np.zeros(self._scales.size, dtype=bool)
-        alone = replace(full.bent if full.errs else full, drawn=None)
-        free = np.ix_(~held, ~held)
-        matrix, inverse = np.full((2, held.size, held.size), np.nan)
-        matrix[free], inverse[free] = alone.matrix, alone.inverse
-        scales = np.outer(self._scales, self._scales)
-        return matrix * scales, inverse * scales
+        full, n, scales = self.uncertainty, len(self.bests), np.outer(self._scales, self._scales)
+        curvatures = full.bent.curvatures if full.errs else None
+        alone = Uncertainty(full.blocks[:n], self._scales, curvatures and curvatures[:n])
+        return alone.matrix * scales, alone.inverse * scales
 
     def own_errors(self, test: int, names: Sequence[str]) -> Array:
         """Return the covariance of own parameters from a test's data alone, SI; else 0."""

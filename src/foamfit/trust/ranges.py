@@ -101,9 +101,8 @@ def _with_other_zeros(best: BestPoint) -> Array:
 
     To first order, within the limits of the parameters.
     """
-    moves = best.sizes[:, None] * (np.linalg.pinv(best.scaled, rcond=1e-10) @ best.shifts)
-    sides = np.concatenate([moves, -moves], axis=1).T
-    return np.asarray(np.clip(best.values[best.places] + sides, *best.box))
+    steps = best.answer(np.concatenate([best.shifts, -best.shifts], axis=1)).T
+    return np.asarray(np.clip(best.values[best.places] + steps, *best.box))
 
 
 def _held(refit: Refit, side: int, along: Array, most: float) -> list[Array]:

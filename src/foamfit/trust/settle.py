@@ -182,8 +182,7 @@ def _zero_by_errors(best: BestPoint, name: str, *, step: bool = False) -> float:
         return 0.0
     column, value = best.names.index(name), best.value(name)
     if step:
-        ahead = np.linalg.lstsq(best.scaled, -best.residual, rcond=1e-10)[0]
-        value = float(ahead[column] * best.sizes[column])
+        value = float(best.answer(best.residual[:, None])[column, 0])
     return value / float(best.spread.stderr[column])
 
 
