@@ -42,8 +42,8 @@ from foamfit.trust.covariance import Ends
 from foamfit.trust.identifiability import Insight, look
 from foamfit.trust.residuals.law_error import CurveError
 
-# If an interval and the local one differ by more than this factor, the local one is misleading.
-ASTRAY = 2.0
+# A profile narrower than the local interval by more than this factor has stalled.
+STALLED = 2.0
 SHORT = 0.8  # share of the change by friction that a linear step finds, in synthetic records
 CLOSE = 0.9  # smallest correlation that is named
 UNDER = 0.05  # share of the peak stress, above which a record ends under load
@@ -355,9 +355,8 @@ def _varied(
     points = (*intervals.ends.get(name, local), value)
     ends = min(points), max(points)
     width, local_width = (min(pair[1], high) - max(pair[0], low) for pair in (ends, local))
-    ratio = width / local_width if local_width > 0.0 else math.nan
     # Refits that stall in a long valley make a profile too narrow: use the wider local interval.
-    stalled = ratio < 1.0 / ASTRAY and method == "profile likelihood"
+    stalled = method == "profile likelihood" and STALLED * width < local_width
     ends = local if stalled else ends
     span = intervals.ranges.get(name)
     if span is not None:  # it may belong to the point before the last improvement
@@ -373,10 +372,9 @@ def _varied(
     state, why = judged(settled, best, name, (ends[0] + zero, ends[1] + zero), (state, why))
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
-    astray = name in intervals.ends and (ratio < 1.0 / ASTRAY or ASTRAY < ratio < math.inf)
     method = "local covariance" if stalled else method
     doubtful = name in intervals.doubtful and method == "local covariance"
-    why = say("why", "interval", why=why, doubtful=doubtful, stalled=stalled, astray=astray)
+    why = say("why", "interval", why=why, doubtful=doubtful, stalled=stalled)
     ci95, stderr = (max(ends[0], low), min(ends[1], high)), float(best.spread.stderr[column])
     return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method, span)
 

@@ -24,7 +24,7 @@ from foamfit.springs.parameters import NUISANCE
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING, WEAK
-from foamfit.trust.profile import BETTER, PLACED, SIDES, STEPS, Refit, departures, trace
+from foamfit.trust.profile import BETTER, PLACED, SIDES, Refit, departures, trace
 
 # "auto" profiles a parameter if the root of the cost departs from a straight line by this share at
 # an end of its local interval.
@@ -96,21 +96,19 @@ def assess(
     others = [(point, tracker.consider(point)) for point in minima]
     if method == "profile":
         return _with_minima(best, _by_profiles(best, dict.fromkeys(known, SIDES), tracker), others)
-    far = np.abs(departures(best)).max(axis=1, initial=0.0)
-    order = sorted(known, key=lambda name: -far[best.names.index(name)])
-    bent = [name for name in order if far[best.names.index(name)] > BENT]
-    # Where the range is wider, model error outweighs noise, and a local interval is enough. Where
-    # other minima leave the parameter undetermined, a profile would not change that.
+    far = departures(best)
+    bent = sorted((name for name in known if far[name] > BENT), key=lambda name: -far[name])
+    # Where the range is wider, model error outweighs noise, and a local interval is enough.
     local = [n for n in bent if n in ranges and np.ptp(ranges[n]) > np.ptp(best.local(n))]
-    wide = {n: best.local(n) for n in bent} | _with_minima(best, Intervals(), others).ends
-    lost = [n for n in bent if np.ptp(wide[n]) > 2.0 * NOTHING * best.size(n)]
-    # On a side where another minimum extends the interval, a profile would hardly do so.
-    sides = {
-        n: [sign for sign, *ends in zip((-1.0, 1.0), best.local(n), wide[n], strict=True)
-            if ends[0] == ends[1]]
-        for n in bent if n not in (*local, *lost)
-    }  # fmt: skip
-    made = _by_profiles(best, {n: sign for n, sign in sides.items() if sign}, tracker, budget)
+    wide, sides = _with_minima(best, Intervals(), others).ends, dict[str, list[float]]()
+    for name in (name for name in bent if name not in local):
+        own, ends = best.local(name), wide.get(name, best.local(name))
+        # Where other minima leave the parameter undetermined, a profile would not change that; on a
+        # side where one extends the interval, it would hardly do so.
+        open_to = [sign for sign, a, b in zip(SIDES, own, ends, strict=True) if a == b]
+        if open_to and np.ptp(ends) <= 2.0 * NOTHING * best.size(name):
+            sides[name] = open_to
+    made = _by_profiles(best, sides, tracker, budget)
     made = _with_minima(best, replace(made, doubtful=(*made.doubtful, *local)), others)
     return made if best.misfits or made.better is not None else _with_far(best, made, tracker)
 
@@ -170,12 +168,10 @@ def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
             if name in NUISANCE or high - low > 2.0 * WEAK * best.sizes[column]:
                 continue
             least, most = best.limits(name)
-            # A local interval of a cost that is not a parabola needs as many as a profile.
-            iterations = STEPS if name in made.doubtful else ITERATIONS
             for outside in (2.0 * low - high, 2.0 * high - low):
                 if name in elsewhere or not least <= outside <= most:
                     continue
-                found = refit.hold(refit.origin, outside, iterations)
+                found = refit.hold(refit.origin, outside, ITERATIONS)
                 if found is None:
                     continue
                 values = refit.values(found)

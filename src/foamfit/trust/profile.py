@@ -21,10 +21,9 @@ from foamfit.trust.best_point import BestPoint
 # A refit ends if the expected gain of the cost is below this share of the 95 % cut.
 ENOUGH = 1e-4
 STEPS = 40  # largest number of steps of a refit
-# The first refit is at the end of the local interval. Later steps outward, and the first one if the
-# others cannot follow so far (if the root of χ² before the refit exceeds `ASTRAY` times that of the
-# cut), are this share of half the interval; they grow where the cost hardly rises.
-STEP, ASTRAY, GROWTH, HARDLY = 0.5, 2.0, 1.6, 0.35
+# The first refit is at the end of the local interval. The first step outward from there is this
+# share of half of it, each later one this multiple of the one before.
+STEP, GROWTH = 0.5, 1.6
 # A profile is followed until the root of χ² is this multiple of that of the cut, to cross small
 # barriers between shallow minima, unless its first refit shows a parabola: the roots agree by this
 # share.
@@ -194,10 +193,7 @@ class _Side:
             self.refits.append(found)
             if self.root(found) >= BEYOND or self.better or self.parabola:
                 break
-            if step == self.half:
-                step *= STEP
-            if self.root(found) - self.root(last) < HARDLY:
-                step *= GROWTH
+            step *= STEP if step == self.half else GROWTH
 
     def _within(self, value: float) -> float:
         """Return a value, or the limit if it lies beyond."""
@@ -236,32 +232,25 @@ def trace(
     return profile, refit.values(min(refits, key=lambda at: at.cost)) if better else None
 
 
-def departures(best: BestPoint) -> Array:
-    """Return the departure of the cost from a parabola at both ends of each interval, (k, 2).
+def departures(best: BestPoint) -> dict[str, float]:
+    """Return the departure of the cost from a parabola for each parameter, at least zero.
 
-    A parameter is moved to an end of its local interval (less if the simulation fails there), the
-    others follow, and one linear step of these, with the local slopes, completes the refit. The
-    departure is the root of the rise over that of a parabola, less 1; it is zero if a limit is
-    close to the best point, infinite if the simulation fails.
+    A parameter is moved to an end of its local interval, the others follow, and one linear step of
+    these, with the local slopes, completes the refit. The departure is the difference between 1 and
+    the root of the rise over that of a parabola, the larger one of both ends; a limit close to the
+    best point has none. It is infinite if the simulation fails.
     """
-    out, tracker = np.zeros((len(best.names), 2)), Tracker(best.problem.objective)
-    for i, name in enumerate(best.names):
-        refit, value, half = Refit(best, tracker, name), best.value(name), float(best.halves[i])
-        for side, limit in enumerate(best.limits(name)):
-            if abs(limit - value) > 0.05 * half:
-                out[i, side] = _departure(refit, limit - value, half)
+    out, tracker = dict.fromkeys(best.names, 0.0), Tracker(best.problem.objective)
+    columns = zip(best.halves, best.spread.stderr, best.spread.inflation, strict=True)
+    for name, (half, stderr, inflation) in zip(best.names, columns, strict=True):
+        refit, value = Refit(best, tracker, name), best.value(name)
+        for limit in best.limits(name):
+            if not abs(limit - value) > 0.05 * half:
+                continue
+            shift = min(max(limit - value, -half), half)
+            found, root = refit.shifted(refit.origin, value + shift), math.inf
+            if found is not None:
+                rise = refit.after_step(found) - refit.after_step(refit.origin)
+                root = math.sqrt(max(rise / inflation, 0.0)) * stderr / abs(shift)
+            out[name] = max(out[name], abs(root - 1.0))
     return out
-
-
-def _departure(refit: Refit, to_limit: float, half: float) -> float:
-    """Return the departure towards a limit (SI, signed) at an end of an interval."""
-    origin, column = refit.origin, refit.best.names.index(refit.name)
-    stderr, inflation = (getattr(refit.best.spread, n)[column] for n in ("stderr", "inflation"))
-    for share in (1.0, 0.5, 0.25):
-        shift = min(share * half, abs(to_limit))
-        value = refit.best.value(refit.name) + math.copysign(shift, to_limit)
-        if (found := refit.shifted(origin, value)) is not None:
-            rise = refit.after_step(found) - refit.after_step(origin)
-            root = math.sqrt(max(rise / float(inflation), 0.0))
-            return root * float(stderr) / shift - 1.0
-    return math.inf

@@ -116,14 +116,7 @@ def keep_to_record(
     if other.best_values is None:
         return problem, None
     if other.best_cost < tracker.best_cost:  # the search with these free had missed a minimum
-        free = _afresh(tracker, [other.best_values])
-        descend_again(problem, free)
-        assert free.best_values is not None
-        values = free.best_values
-        if not errs(BestPoint(problem, values)):
-            tracker.best_values, tracker.best_cost = values, free.best_cost
-            tracker.ends += [*other.ends, *free.ends]
-            return problem, None
+        values = other.best_values
     tracker.best_values, tracker.best_cost, tracker.ends = (
         other.best_values, other.best_cost, other.ends,
     )  # fmt: skip
