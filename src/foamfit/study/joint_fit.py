@@ -34,7 +34,7 @@ from foamfit.trust.intervals import FAR, HARDLY_WORSE
 from foamfit.trust.joint_point import Error, JointPoint
 from foamfit.trust.profile import PLACED
 from foamfit.trust.ranges import ITERATIONS, TRIALS, left_open, nearer, tolerance
-from foamfit.trust.residuals.law_error import CurveError, curve_errors
+from foamfit.trust.residuals.law_error import CurveError
 from foamfit.trust.scatter import Spread, common_and_spread, correlation
 
 ROUNDS = 12  # most iterations between best values and spreads
@@ -157,8 +157,7 @@ def correlation_of(
 def errors_of(found: Together) -> tuple[tuple[CurveError, ...], ...]:
     """Return noise and model error in each curve of each test; see `BestPoint.errors`."""
     point = JointPoint(found)
-    every = enumerate(point.bests)
-    return tuple(curve_errors(*best.to_judge(point.taken(t))) for t, best in every)
+    return tuple(best.judged(point.taken(t)) for t, best in enumerate(point.bests))
 
 
 def ranges_of(point: JointPoint) -> dict[str, Ends]:

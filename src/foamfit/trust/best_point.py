@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,15 +118,15 @@ class BestPoint:
     @cached_property
     def errors(self) -> tuple[CurveError, ...]:
         """Noise and model error in the residual of each fitted curve."""
-        return curve_errors(*self.to_judge())
+        return self.judged()
 
     @cached_property
     def scaled(self) -> Array:
         """Derivative of `residual` by the scaled parameters, (n_data, k)."""
         return np.asarray(self.jacobian * self.sizes)
 
-    def to_judge(self, taken: Array | None = None) -> tuple[Any, ...]:
-        """Return the arguments of `curve_errors`; `taken` is the noise absorbed by a joint fit."""
+    def judged(self, taken: Array | None = None) -> tuple[CurveError, ...]:
+        """Return the `errors` if a fit of several tests has absorbed `taken` of the noise."""
         objective = self.problem.objective
         # Noise of a driving stress that explains the residual has slow waves, as has that of a
         # velocity before its integration.
@@ -137,7 +136,7 @@ class BestPoint:
             every = "stress" in test.derived
             motion = "displacement_time"
             slow = {i for i, curve in enumerate(objective.counted) if every or curve == motion}
-        return self.residual, self.scaled, objective.sizes, taken, slow
+        return curve_errors(self.residual, self.scaled, objective.sizes, taken, slow)
 
     @cached_property
     def contradictions(self) -> tuple[Contradiction, ...]:
