@@ -15,6 +15,7 @@ from foamfit.solve import cache
 from foamfit.solve.compiled import run
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled import compiled, contract
+from foamfit.springs.compiled.contract import BY_STRESS, FADES, INTERNAL
 from foamfit.springs.laws.record import OWN_ETA, Law
 
 Memory = tuple[NDArray[np.int64], Array]  # the integers and floats of a run
@@ -42,12 +43,17 @@ class Shape(NamedTuple):
     directions: bytes  #: of the derivatives, integers (p, 2)
     struck: bool  #: whether the drive is an impact
     degree: int  #: of implicit steps; 0 for explicit ones
-    solved: bool  #: whether the rest of the state is computed, or nothing is integrated
+    integrated: bool  #: whether it takes steps in time
 
+    @property
+    def solved(self) -> bool:
+        """Whether the rest of the state is computed, or nothing is integrated."""
+        return self.degree > 0 or not self.integrated
 
-def _groups(shape: Shape) -> list[range]:
-    """Return the springs of each group."""
-    return [range(i, j) for i, j in pairwise((0, *shape.ends))]
+    @property
+    def groups(self) -> list[range]:
+        """The springs of each group."""
+        return [range(i, j) for i, j in pairwise((0, *self.ends))]
 
 
 def place_state(shape: Shape, numbers: np.recarray, nodes: int) -> tuple[list[int], int]:
@@ -56,7 +62,7 @@ def place_state(shape: Shape, numbers: np.recarray, nodes: int) -> tuple[list[in
     more, count = run.SCALES + len(shape.laws) + 2 * nodes, len(shape.laws)
     kinds = list(range(more - 2 * nodes, more))
     several = [False] * count
-    for g, springs in enumerate(_groups(shape)):
+    for g, springs in enumerate(shape.groups):
         alone = len(springs) == 1 and not (
             g == len(shape.ends) - 1 and shape.top in (STRESS, VISCOUS)
         )
@@ -93,7 +99,7 @@ def order(shape: Shape, numbers: np.recarray, nodes: int) -> tuple[list[int], li
     damped = np.frombuffer(shape.damped, bool)
     found: list[tuple[int, int]] = []  # component and group, in order
     sizes = [0]
-    for g, springs in enumerate(_groups(shape)):
+    for g, springs in enumerate(shape.groups):
         one = [2 * g, 2 * g + 1] if g < nodes else []
         for i in springs:
             own = numbers[i]
@@ -121,12 +127,13 @@ def _owned(count: int, directions: list[list[int]]) -> list[int]:
 
 
 def _functions(
-    shape: Shape, integrated: bool, several: bool, internal: bool, fades: bool, relaxes: bool
+    shape: Shape, several: bool, internal: bool, fades: bool, relaxes: bool
 ) -> tuple[int, ...]:
     """Return the addresses of the functions that a run needs, 0 for others (see run.ADDRESSES).
 
     A module is imported, and a function compiled, when its address is first asked for.
     """
+    integrated = shape.integrated
     if integrated:
         from foamfit.solve.compiled import loop
 
@@ -145,40 +152,19 @@ def _functions(
     )
 
 
-def _memory_of_decay(one: contract.Compiled, p: int) -> int:
-    """Return the length of the memory of `decay`, 0 if it is not needed."""
-    return one.internal * (11 + 2 * 8 + 4 * p) if one.flows == contract.FADES else 0
-
-
-def _memory_of_relaxation(shape: Shape, allowed: bool) -> int:
-    """Return the length of the memory of `series`, 0 if a scene needs other steps."""
-    count, known = len(shape.laws), shape.top in (MOTION, STRESS)
-    needed = shape.terms > 0 and shape.degree == 0 and len(shape.ends) == 1
-    needed = needed and allowed and known and not any(shape.damped)
-    return count * (4 + 8 * shape.terms) if needed else 0
-
-
-def _numbers(one: contract.Compiled) -> tuple[int, ...]:
-    """Return the integers of a spring, without its places."""
-    kind = one.kind == contract.BY_STRESS, one.kind == contract.INTERNAL
-    return (*one.addresses, *kind, one.derivatives, one.internal, 0, 0, 0, 0)
-
-
 @lru_cache(maxsize=1024)
-def lay_out(
-    laws: tuple[Law, ...], terms: int, ends: tuple[int, ...], top: int, damped: bytes,
-    directions_of: bytes, struck: bool, degree: int, integrated: bool = True,
-) -> Layout:  # fmt: skip
-    """Lay out a run, see `Shape`; `integrated` is whether it takes steps in time."""
-    solved = degree > 0 or not integrated
-    shape = Shape(laws, terms, ends, top, damped, directions_of, struck, degree, solved)
+def lay_out(shape: Shape) -> Layout:
+    """Lay out a run."""
     made = [compiled(law) for law in shape.laws]
     directions = np.frombuffer(shape.directions, np.int64).reshape(-1, 2).tolist()
     count, groups, p = len(made), len(shape.ends), len(directions)
     nodes = groups if shape.top in (FREE, VISCOUS) else groups - 1
-    numbers = np.array(
-        [_numbers(one) for one in made], [(name, np.int64) for name in run.NUMBERS]
-    ).view(np.recarray)
+    of_springs = [
+        (*one.addresses, one.kind == BY_STRESS, one.kind == INTERNAL, one.derivatives, one.internal,
+         *(0,) * 4)  # places
+        for one in made
+    ]  # fmt: skip
+    numbers = np.array(of_springs, [(name, np.int64) for name in run.NUMBERS]).view(np.recarray)
     kinds, carries = place_state(shape, numbers, nodes)
     base, internals = len(kinds), sum(one.internal for one in made)
     n = base + carries * p
@@ -189,9 +175,11 @@ def lay_out(
     places, groups_of, reach = order(shape, numbers, nodes) if shape.degree else ([], [], 0)
     size = carries if shape.degree else 0
     parameters = max(one.derivatives for one in made)
-    internal = any(one.kind == contract.INTERNAL for one in made)
-    fades = 0 if integrated else _memory_of_decay(made[0], p)
-    relaxes = _memory_of_relaxation(shape, integrated and not internal)
+    internal = any(one.kind == INTERNAL for one in made)
+    fades = not shape.integrated and made[0].flows == FADES
+    relaxes = shape.terms > 0 and shape.degree == 0 and shape.integrated and not internal
+    relaxes = relaxes and groups == 1 and shape.top in (MOTION, STRESS) and not any(shape.damped)
+    aside = relaxes * count * (4 + 8 * shape.terms), count * (1 + shape.terms) + groups + 1
     lengths = {
         "springs": count * width, "per_mass": groups, "drive": len(run.DRIVE), "carried": groups,
         "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
@@ -200,7 +188,7 @@ def lay_out(
         "now": len(run.NOW), "stage": run.STAGES * wide, "line": run.LINE * wide, "y": wide,
         "new": wide, "state": wide, "f": wide, "nil": wide, "errors": 2 * wide,
         "batch": run.BATCH * (6 + contract.BY + parameters) + 2 * p + 8 * contract.MOST_TERMS + 8,
-        "aside": max(fades, relaxes, internal * (count * (1 + shape.terms) + groups + 1)),
+        "aside": max(fades * made[0].internal * (27 + 4 * p), *aside),
         "jacobian": size * (2 * reach + 1), "alive": 2 * groups if size else 0,
         "largest": p if size else 0, "kept": count * width + groups if size and p else 0,
         "systems": 2 * run.SYSTEMS * size * (3 * reach + 1),
@@ -212,11 +200,11 @@ def lay_out(
     )  # fmt: skip
     at = np.cumsum([0, *(lengths[name] for name in run.FLOATS)])
     whole = np.cumsum([run.WORDS, *map(len, arrays)])
-    several = any(len(springs) > 1 for springs in _groups(shape))
+    several = any(len(springs) > 1 for springs in shape.groups)
     several = several or shape.top in (STRESS, VISCOUS)
     words = [
         *at[:-1], *whole[:-1], *([0] * len(run.GIVEN)),
-        *_functions(shape, integrated, several, internal, fades > 0, relaxes > 0),
+        *_functions(shape, several, internal, fades, relaxes),
         row, width, count, groups, nodes, p, base, carries, shape.terms, shape.top,
         int(shape.solved), wide, shape.degree, reach, 0, 0, 0, 0,
     ]  # fmt: skip

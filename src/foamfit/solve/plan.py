@@ -15,7 +15,7 @@ from foamfit.solve import cache, histories
 from foamfit.solve import scene as scenes
 from foamfit.solve.compiled import along, loop, rates, static
 from foamfit.solve.compiled.run import AT, ENDED, FINITE, NOW, OUTCOME, POINTS, SWITCHES, TOLD
-from foamfit.solve.layout import Layout, Memory, lay_out
+from foamfit.solve.layout import Layout, Memory, Shape, lay_out
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
 from foamfit.solve.scene import NO_SWITCHES, Slopes
 from foamfit.solve.scene import Motion as Motion
@@ -140,10 +140,11 @@ class Plan(NamedTuple):
         terms = self.terms
         if terms and not rows[:, 1 : 1 + 2 * terms : 2].any():  # no strength: as without terms
             terms = terms if (directions[:, 1] >= OWN_RELAXATION).any() else 0
-        return lay_out(
+        shape = Shape(
             self.laws.records, terms, self.ends, self.top, damped, directions.tobytes(),
             self.speed > 0.0, degree, integrated,
         )  # fmt: skip
+        return lay_out(shape)
 
     def _slopes(self, rows: Array) -> Array:
         return slopes_of(self.laws.made, rows[:, 1 + 2 * self.terms :])

@@ -1,14 +1,20 @@
-"""Prescribed stress or motion of the top: its pieces between samples, and the start from rest."""
+"""Prescribed stress or motion of the top: its pieces between samples, and the start from rest.
+
+A drive whose first sample is not zero takes the springs there on a ramp, while time stands still:
+dashpots, relaxation terms and the rates B and stresses V of laws do nothing, and nodes rest.
+"""
 
 from __future__ import annotations
 
-from foamfit.solve.compiled import motion
-from foamfit.solve.compiled.motion import evaluate, in_contact, rates, rates_of
-from foamfit.solve.compiled.run import call_inside, driving, numbers, spring, sum_gain, write
+import math
+
+from foamfit.solve.compiled.motion import in_contact, rates
+from foamfit.solve.compiled.run import driving, numbers, spring, sum_gain, write
 from foamfit.solve.compiled.samples import KNOWN, row_of
-from foamfit.solve.compiled.static import bring, push_to
-from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
+from foamfit.solve.scene import MOTION, STRESS
 from foamfit.springs.compiled.contract import inner, past
+
+RAMP = 1e-9  # time of a ramp over the duration
 
 
 @inner
@@ -24,74 +30,60 @@ def _begin_piece(c, k):
 
 
 @inner
-def _starts_on_ramp(c):
-    """Whether internal variables change up to the first sample of a drive."""
-    internal = 0
+def _begin_ramp(c, want):
+    """Begin a ramp to the first sample of a drive. Under a prescribed stress dashpots are rigid."""
+    r, drive, t, terms = c.now, c.drive, c.time, c.terms
+    brief = RAMP * (t[c.samples - 1] - t[0]) if c.samples > 1 else RAMP
+    r.now, r.begun, r.horizon, r.piece, r.paused = 0.0, t[0] - brief, brief, -1.0, math.inf
+    aside, masses = c.aside, past(c.aside, c.count * (1 + terms))
+    for g in range(c.groups):
+        masses[g], c.per_mass[g] = c.per_mass[g], 0.0
+    masses[c.groups] = drive.pace
+    drive.value, drive.value_rate, drive.pace = 0.0, c.values[0] / brief, 0.0
+    drive.shift, drive.shift_rate = 0.0, in_contact(c, c.none) / brief
     for i in range(c.first[c.groups - 1], c.count):
-        internal += numbers(c, i).internal
-    return internal > 0 and c.values[0] != 0.0 and (c.top == MOTION or c.top == STRESS)
-
-
-@inner
-def _start(c):
-    """Bring the springs above the last mass into equilibrium with the first sample of a drive.
-
-    Under a prescribed stress, springs with a dashpot start from rest.
-    """
-    g, y = c.groups - 1, c.y
-    i0, i1 = c.first[g], c.first[g + 1]
-    _begin_piece(c, c.none)
-    first = c.drive.value
-    if c.top == FREE or c.top == VISCOUS:
-        return
-    for i in range(i0, i1):
-        spring(c, i).gain = 1.0  # relaxation terms carry nothing yet
-    if c.top == STRESS:
-        for i in range(i0, i1):
-            if spring(c, i).eta == 0.0:
-                push_to(c, i, first, 0.0, y)
-    else:
-        first = bring(c, i0, i1, first, 0.0, y)
-    for i in range(i0, i1):
         s, n = spring(c, i), numbers(c, i)
-        evaluate(c, i, int(c.p > 0))
-        s.tangent, s.total = s.slope, s.sigma
-        if n.eps_at >= 0:
-            y[n.eps_at] = s.eps
-        if n.by_stress and n.x_at >= 0:
-            y[n.x_at] = s.x
-        for k in range(c.terms):
-            y[n.z_at + k] = -s.total
-    if c.p > 0:
-        _derive_start(c, g, i0, i1, first)
-    for i in range(i0, i1):
-        sum_gain(c, i)
+        kept = past(aside, i * (1 + terms))
+        kept[0], s.gain = s.eta, 1.0
+        if s.eta > 0.0:
+            s.eta = s.loss = 0.0 if c.top == MOTION else math.inf
+            n.fixed = int(c.top == MOTION and n.eps_at >= 0)
+        for k in range(terms):
+            kept[1 + k], s.g[k] = s.g[k], 0.0
+    rates(c, c.y, c.stage, want, 0.0)
 
 
 @inner
-def _derive_start(c, g, i0, i1, common):
-    """Fill the derivatives of the state at rest, where relaxation terms carry nothing.
-
-    A prescribed motion has moved the springs before their dashpots carry anything.
-    """
-    y, p, base = c.y, c.p, c.base
-    c.carried[g] = common
-    for i in range(i0, i1):
-        s = spring(c, i)
-        s.offset = s.eta
-        s.eta = 0.0 if c.top == MOTION else s.eta
-    rates_of(c, g, y, c.f, motion.ONLY_DERIVATIVES, 0.0)
-    for i in range(i0, i1):
-        s, n, strain = spring(c, i), numbers(c, i), past(c.strain, i * p)
-        s.eta, s.offset = s.offset, 0.0
-        slope, part, at = s.slope, past(c.part, i * p), base + n.eps_at * p
-        if s.eta > 0.0 and n.eps_at >= 0:
+def _end_ramp(c, want):
+    """Let time pass again: relaxation terms begin at zero, and dashpots at the present strain."""
+    y, p, terms = c.y, c.p, c.terms
+    aside, masses = c.aside, past(c.aside, c.count * (1 + terms))
+    rates(c, y, c.stage, want, c.now.now)
+    c.drive.pace, c.now.grow, c.now.paused = masses[c.groups], 1.0, 0.0
+    for g in range(c.groups):
+        c.per_mass[g] = masses[g]
+    for i in range(c.first[c.groups - 1], c.count):
+        s, n = spring(c, i), numbers(c, i)
+        kept = past(aside, i * (1 + terms))
+        strain, part = past(c.strain, i * p), past(c.part, i * p)
+        for k in range(terms):
+            s.g[k] = kept[1 + k]
+            y[n.z_at + k] = -s.sigma
             for j in range(p):
-                strain[j] = y[at + j] = strain[j] if c.top == MOTION else 0.0
-        for k in range(c.terms):
-            z = past(y, base + (n.z_at + k) * p)
+                y[c.base + (n.z_at + k) * p + j] = -(s.steep * strain[j] + part[j])
+        sum_gain(c, i)
+        if kept[0] == 0.0:
+            continue
+        s.eta = s.loss = kept[0]
+        if n.eps_at >= 0 and c.top == MOTION:
+            y[n.eps_at] = s.eps
             for j in range(p):
-                z[j] = -(slope * strain[j] + part[j])
+                y[c.base + n.eps_at * p + j] = strain[j]
+        if n.fixed:
+            first, n.fixed = past(s.by, 2), 0
+            for k in range(n.internals if n.internal else c.none):
+                for j in range(p):
+                    y[c.base + (n.x_at + k) * p + j] += first[k] * strain[j]
 
 
 @inner
@@ -112,7 +104,7 @@ def _next_piece(c, want):
     """
     r, k, t = c.now, int(c.now.piece) + 1, c.time
     if k == 0:  # after a ramp
-        call_inside(c, motion.END_RAMP, c.none, want, c.y, c.stage, c.y, c.y)
+        _end_ramp(c, want)
         _begin_piece(c, k)
     r.piece, jumps = k, k > 0 and c.top == MOTION and c.groups == 1 and _is_damped(c)
     if jumps or k == c.samples - 1:
@@ -138,10 +130,10 @@ def next_piece(c, starts, want):
     """Start from rest, or begin the next piece; return whether all samples are written."""
     if not starts:
         return _next_piece(c, want)
-    if _starts_on_ramp(c):
-        call_inside(c, motion.BEGIN_RAMP, c.none, want, c.y, c.stage, c.y, c.y)
+    if c.values[0] != 0.0 and (c.top == MOTION or c.top == STRESS):
+        _begin_ramp(c, want)
         return c.none
-    _start(c)
+    _begin_piece(c, c.none)
     rates(c, c.y, c.stage, want, 0.0)
     write(c, c.y, 0.0, c.none, want)
     return int(c.samples == 1)

@@ -202,7 +202,7 @@ def derive_group(c, g, y, f):
                 call_inside(c, motion.LOSSES, i, c.none, y, f, y, total)
         else:
             for j in range(p):
-                total[j] += own[p + j] * s.rate
+                total[j] += c.drive.pace * own[p + j] * s.rate
             if slope > 0.0:
                 share = s.height / slope
         over = -s.rate if loose < 0 else 0.0

@@ -1,4 +1,4 @@
-"""What only springs of INTERNAL laws need: derivatives, jumps, the stress V, starts of drives.
+"""What only springs of INTERNAL laws need: derivatives, jumps, the stress V.
 
 The results of such a law are σ, V and the rates A, B of each internal variable, and their
 derivatives, see `compiled.contract`.
@@ -8,9 +8,6 @@ strain these are unknown, and u = δx - A δε is integrated instead, the deriva
 du/dt = dε/dt (A_x u + A_p) + δB - A_x B δε.
 
 In a group of several springs the strain rate of one with a stress V solves T + V + η dε/dt = S.
-
-A drive whose first sample is not zero takes internal variables there on a ramp, while time stands
-still: B, V, dashpots and relaxation terms do nothing, and nodes rest.
 """
 
 from __future__ import annotations
@@ -18,9 +15,9 @@ from __future__ import annotations
 import math
 
 from foamfit.solve.compiled import motion
-from foamfit.solve.compiled.motion import evaluate, in_contact, rates
-from foamfit.solve.compiled.run import numbers, spring, sum_gain, working
-from foamfit.solve.scene import MOTION, VISCOUS
+from foamfit.solve.compiled.motion import evaluate
+from foamfit.solve.compiled.run import numbers, spring, working
+from foamfit.solve.scene import VISCOUS
 from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import ALONG_A, ALONG_B, BY_RATE, inner, past
 from foamfit.springs.laws.record import OWN_ETA
@@ -28,7 +25,6 @@ from foamfit.springs.laws.record import OWN_ETA
 LEAST_RATE = 1e-25  # smaller strain rates are zero, 1/s
 MOST_RATE = 1e30  # larger ones mean that V vanishes, so that no stress determines the rate
 ENOUGH = 2e-15  # relative change of a rate or stress that ends Newton's method
-RAMP = 1e-9  # time of a ramp to the first sample over the duration
 
 
 @contract.inlined
@@ -251,66 +247,6 @@ def _losses(c, i, y, out):
     _friction(c, i, past(c.common, c.groups * p), out)
 
 
-# ---------------------------------------------------------------- the start of a drive
-
-
-@inner
-def _begin_ramp(c, want):
-    """Begin a ramp to the first sample of a drive. Under a prescribed stress dashpots are rigid."""
-    r, drive, t, terms = c.now, c.drive, c.time, c.terms
-    brief = RAMP * (t[c.samples - 1] - t[0]) if c.samples > 1 else RAMP
-    r.now, r.begun, r.horizon, r.piece = 0.0, t[0] - brief, brief, -1.0
-    aside, masses = c.aside, past(c.aside, c.count * (1 + terms))
-    for g in range(c.groups):
-        masses[g], c.per_mass[g] = c.per_mass[g], 0.0
-    masses[c.groups] = drive.pace
-    drive.value, drive.value_rate, drive.pace = 0.0, c.values[0] / brief, 0.0
-    drive.shift, drive.shift_rate = 0.0, in_contact(c, c.none) / brief
-    for i in range(c.first[c.groups - 1], c.count):
-        s, n = spring(c, i), numbers(c, i)
-        kept = past(aside, i * (1 + terms))
-        kept[0], s.gain = s.eta, 1.0
-        if s.eta > 0.0:
-            s.eta = s.loss = 0.0 if c.top == MOTION else math.inf
-            n.fixed = int(c.top == MOTION and n.eps_at >= 0)
-        for k in range(terms):
-            kept[1 + k], s.g[k] = s.g[k], 0.0
-    rates(c, c.y, c.stage, want, 0.0)
-
-
-@inner
-def _end_ramp(c, want):
-    """Let time pass again: relaxation terms begin at zero, and dashpots at the present strain."""
-    y, p, terms = c.y, c.p, c.terms
-    aside, masses = c.aside, past(c.aside, c.count * (1 + terms))
-    rates(c, y, c.stage, want, c.now.now)
-    c.drive.pace, c.now.grow = masses[c.groups], 1.0
-    for g in range(c.groups):
-        c.per_mass[g] = masses[g]
-    for i in range(c.first[c.groups - 1], c.count):
-        s, n = spring(c, i), numbers(c, i)
-        kept = past(aside, i * (1 + terms))
-        strain, part = past(c.strain, i * p), past(c.part, i * p)
-        for k in range(terms):
-            s.g[k] = kept[1 + k]
-            y[n.z_at + k] = -s.sigma
-            for j in range(p):
-                y[c.base + (n.z_at + k) * p + j] = -(s.steep * strain[j] + part[j])
-        sum_gain(c, i)
-        if kept[0] == 0.0:
-            continue
-        s.eta = s.loss = kept[0]
-        if n.eps_at >= 0 and c.top == MOTION:
-            y[n.eps_at] = s.eps
-            for j in range(p):
-                y[c.base + n.eps_at * p + j] = strain[j]
-        if n.fixed:
-            first, n.fixed = past(spring(c, i).by, 2), 0
-            for k in range(n.internals if n.internal else c.none):
-                for j in range(p):
-                    y[c.base + (n.x_at + k) * p + j] += first[k] * strain[j]
-
-
 @working
 def inside_task(c, task, i, up, y, f, quicker, out):
     """Do one task, for a spring or a group."""
@@ -328,9 +264,5 @@ def inside_task(c, task, i, up, y, f, quicker, out):
         _share(c, i)
     elif task == motion.LOSSES:
         _losses(c, i, y, out)
-    elif task == motion.BEGIN_RAMP:
-        _begin_ramp(c, up)
-    elif task == motion.END_RAMP:
-        _end_ramp(c, up)
     else:
         _jump(c, i, up, y)

@@ -294,6 +294,7 @@ def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log):
     r, given, want = c.now, start(reals), int(c.p > 0)
     struck, tol, most, stalled, done = int(given[SPEED] > 0.0), given[TOL], given[MOST], 0, 0
     _begin(c, given)
+    longest = _longest(c, want)
     if struck:
         _strike(c, want)
         short = FIRST * r.brief
@@ -304,7 +305,7 @@ def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log):
     else:
         done = run.call_drive(c, 1, want)
         r.step = r.horizon
-    outcome, ended, longest = scene.DONE, math.nan, _longest(c, want)
+    outcome, ended = scene.DONE, math.nan
     gives_up = given[FOLLOWED] > 0.0 and not struck
     while not (done or (struck and int(r.sample) == c.samples)):
         _fresh_scales(c)
@@ -325,6 +326,7 @@ def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log):
             r.horizon = math.nextafter(r.now, math.inf)
         elif r.now >= r.horizon:
             done = run.call_drive(c, 0, want)
+            dt = r.horizon if r.piece == 0.0 else dt  # after a ramp
             _turn(c, want, -1 + c.none)
         r.step = dt
     r.outcome, r.ended, r.finite = outcome, ended, is_finite(c, c.shown)

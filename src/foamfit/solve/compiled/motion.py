@@ -18,7 +18,7 @@ from foamfit.springs.compiled.contract import inlined, inner, past
 from foamfit.springs.laws.record import HEAVIER, MOVED, OWN_RELAXATION
 
 # Tasks of `internal`.
-PART, FLOW, FRICTION, JUMP, PATH, LOSE, SHARE, LOSSES, BEGIN_RAMP, END_RAMP = range(10)
+PART, FLOW, FRICTION, JUMP, PATH, LOSE, SHARE, LOSSES = range(8)
 ALL, IN_STEP = -1, -2  # instead of a group
 ONLY_DERIVATIVES = 2  # instead of 0 or 1 for `want`, where the values are known
 
@@ -97,7 +97,7 @@ def derive_spring(c, i, y):
         for j in range(p):
             total[j] += g * dz[j]
             if directions[2 * j] == i and directions[2 * j + 1] == of_g:
-                total[j] += s.sigma + y[n.z_at + k]
+                total[j] += c.drive.pace * (s.sigma + y[n.z_at + k])
 
 
 @inner
