@@ -29,16 +29,12 @@ _A[STEPPED, :STEPPED] = pair.B
 _FULL = np.zeros((22, ALL_STAGES))
 _FULL[:16], _FULL[16:20], _FULL[20, :13], _FULL[21, :13] = _A, pair.D, pair.E5, pair.E3
 _ROWS = [np.flatnonzero(row) for row in _FULL]
-NONE = np.array([-row.size % 4 for row in _ROWS])  # zeros at the end of a row
-_ROWS = [
-    np.append(row, [row[-1] if row.size else 0] * (-row.size % 4)).astype(int) for row in _ROWS
-]
-FIRST = np.cumsum([0] + [len(row) for row in _ROWS])
-FROM = np.concatenate(_ROWS)
+_WIDE = [(0, -row.size % 4) for row in _ROWS]  # zeros that fill up a row to a multiple of 4
+FIRST = np.cumsum([0, *(row.size + wide[1] for row, wide in zip(_ROWS, _WIDE, strict=True))])
+FROM = np.concatenate([np.pad(row, wide) for row, wide in zip(_ROWS, _WIDE, strict=True)])
 WEIGHT = np.concatenate(
-    [np.where(np.arange(row.size) < row.size - more, full[row], 0.0)
-     for full, row, more in zip(_FULL, _ROWS, NONE, strict=True)]
-)  # fmt: skip
+    [np.pad(full[row], wide) for full, row, wide in zip(_FULL, _ROWS, _WIDE, strict=True)]
+)
 TIMES = pair.C[:ALL_STAGES]
 MIDWAY_STAGE = int(np.flatnonzero(TIMES == events.MIDDLE)[0])
 
@@ -49,29 +45,13 @@ AIMED = 0.77  # growth of a step whose dense output has an error of 1; few steps
 @inner
 def combine(c, n, row, scale, begin, out):
     """Fill out = begin + scale Σ WEIGHT[k] stage[FROM[k]] of a row of coefficients."""
-    first, last, stage, wide = FIRST[row], FIRST[row + 1], c.stage, c.wide
-    if n <= 8:
-        for i in range(0, n, 4):
-            one = two = three = four = 0.0
-            for k in range(first, last - NONE[row]):
-                weight, at = WEIGHT[k], FROM[k] * wide + i
-                one += weight * stage[at]
-                two += weight * stage[at + 1]
-                three += weight * stage[at + 2]
-                four += weight * stage[at + 3]
-            out[i] = begin[i] + scale * one
-            out[i + 1] = begin[i + 1] + scale * two
-            out[i + 2] = begin[i + 2] + scale * three
-            out[i + 3] = begin[i + 3] + scale * four
-        return
-    source = begin
-    for k in range(first, last, 4):  # loops that are vectorised; rows are filled up with zeros
-        one, two = scale * WEIGHT[k], scale * WEIGHT[k + 1]
-        three, four = scale * WEIGHT[k + 2], scale * WEIGHT[k + 3]
+    stage, wide, source = c.stage, c.wide, begin
+    for k in range(FIRST[row], FIRST[row + 1], 4):  # loops that are vectorised
+        one, two, three, four = WEIGHT[k], WEIGHT[k + 1], WEIGHT[k + 2], WEIGHT[k + 3]
         a, b = past(stage, FROM[k] * wide), past(stage, FROM[k + 1] * wide)
         d, e = past(stage, FROM[k + 2] * wide), past(stage, FROM[k + 3] * wide)
         for i in range(n):
-            out[i] = source[i] + (one * a[i] + two * b[i] + (three * d[i] + four * e[i]))
+            out[i] = source[i] + scale * (one * a[i] + two * b[i] + (three * d[i] + four * e[i]))
         source = out
 
 
