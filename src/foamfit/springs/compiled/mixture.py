@@ -183,26 +183,12 @@ def _halfway(low, high, sigma):
 
 
 @inner
-def _held_stress(row, p, rest, eps):
-    """Return the stress at a strain for fixed p without memory: the root of a quadratic."""
-    k0, kc, beyond = row.k0, row.kc, eps - p * row.star
-    a, product = 1.0 - beyond, beyond * k0 * kc
-    if not a > 0.0:
-        return math.inf
-    b = rest * kc + p * k0 - beyond * (k0 + kc)
-    root = math.sqrt(b * b + 4.0 * a * product)
-    return 2.0 * product / (b + root) if b >= 0.0 else (root - b) / (2.0 * a)
-
-
-@inner
 def stress_in(row, s, eps):
     """Return the stress at a strain on the branch; infinite past its end.
 
     The method is Halley's inside a bracket, from a parabola at the previous point.
     """
     branch = int(s.branch)
-    if branch == FIXED and row.remembers == 0.0:
-        return _held_stress(row, s.snapped, s.rest, eps)
     reach = 1.0 + (row.star if moves(branch) or s.snapped > 0.0 else 0.0)
     if not eps < reach:
         return math.inf
