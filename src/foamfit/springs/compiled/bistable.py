@@ -80,7 +80,8 @@ def _fill_linear(opens, given, array):
     row, k0, far = start(array), given[0], math.inf
     low = 0.0 if opens else -far
     for branch in range(4):
-        _write(row, branch, (0.0, k0, 0.0, 0.0, low, far, low, far), OPEN, LINE)
+        by = _write(row, branch, (0.0, k0, 0.0, 0.0, low, far, low, far), OPEN, LINE)
+        by[0] = 1.0
     if opens:
         _write(row, OPEN, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -far, 0.0), OPEN, LINE)
     return 0.0 < k0 < far
@@ -114,15 +115,6 @@ def evaluate(row, s, eps, x, count, want, out):
             of_x0, of_s0 = line[_OF_X0 + c], line[_OF_S0 + c]
             for j in range(count):
                 by[j] = of_k * factor[j] - of_x0 * slope[j] + of_s0
-    return 0.0
-
-
-@contract.evaluating
-def evaluate_linear(row, s, eps, x, count, want, out):
-    k = _branch_of(row, s.branch).k
-    for j in range(count):
-        out[OF_LAW * count + j], out[SLOPE * count + j], out[MISS * count + j] = k * eps[j], k, 0.0
-        out[BY * count + j] = eps[j] if k > 0.0 else 0.0
     return 0.0
 
 
@@ -172,14 +164,14 @@ def strain(row, s, sigma):
     return s.high if s.low == -math.inf and sigma >= 0.0 else s.low
 
 
-_LINEAR = (begin, evaluate_linear, switch, settle, strain)
+_FUNCTIONS = (begin, evaluate, switch, settle, strain)
 _SLOPES = tuple(branch * WIDE + _NAMES.index("k") for branch in (A, C, D))
 _STAR = C * WIDE + _NAMES.index("x0")
-COMPILED = Compiled(
-    fill, contract.EXPLICIT, COLUMNS, PARAMETERS, 0, (begin, evaluate, switch, settle, strain),
-    _SLOPES, _STAR,
-)  # fmt: skip
-LINEAR, UNILATERAL = (
-    Compiled(partial(_fill_linear, opens), contract.EXPLICIT, COLUMNS, 1, 0, _LINEAR, _SLOPES[:1])
-    for opens in (False, True)
+COMPILED, LINEAR, UNILATERAL = (
+    Compiled(given, contract.EXPLICIT, COLUMNS, PARAMETERS, 0, _FUNCTIONS, slopes, pole)
+    for given, slopes, pole in (
+        (fill, _SLOPES, _STAR),
+        (partial(_fill_linear, False), _SLOPES[:1], -1),
+        (partial(_fill_linear, True), _SLOPES[:1], -1),
+    )
 )
