@@ -106,7 +106,10 @@ def _verified(
         rates = scene.fastest_rates(rows, heights, scene.drag)
         explicit = max(rates) / 3.0 <= plans.MOST_WORK / len(heights)
         motion, scene = _resolve_vibrations(scene, motion, rtol, explicit, run)
-    distance = _distance_at_peak(scene, arrays, motion, rtol)
+    distance = _distance(scene, arrays, motion)
+    by_stress = _distance_by_stress(scene, arrays, motion)
+    if scene.speed > 0.0 and not arrays.damped:  # its peak may lie between two samples
+        distance = min(distance, by_stress)
     if 0.3 * rtol * distance < 1e-15:
         raise SimulationError(
             f"a strain comes within {distance:.1g} of the end of its branch, 1 + eps_star, where "
@@ -114,7 +117,7 @@ def _verified(
         )
     forced = 0 if scene.speed > 0.0 else scene.time.size
     long = _is_long(scene, motion, FEW_STEPS + 2 * forced) or inside
-    long = long or min(distance, _distance_by_stress(scene, arrays, motion)) < CLOSE
+    long = long or min(distance, by_stress) < CLOSE
     long = (long and scene.solver == plans.SECOND_ORDER) or sharp
     if not (long or motion.method == plans.RADAU) or rtol < 1e-12:  # a finer run would only round
         return motion
@@ -228,10 +231,10 @@ def _poles(scene: Plan, arrays: ChainArrays) -> Iterator[tuple[int, float, float
             yield i, arrays.rows.item(i, at + one.pole), arrays.rows.item(i, at + one.slopes[1])
 
 
-def _distance(scene: Plan, arrays: ChainArrays, displacement: Array) -> float:
-    """Return the least distance, in strain, of any spring from 1 + ε_*; at most 1."""
-    strain = (np.diff(displacement, axis=0, prepend=0.0).max(axis=1) / arrays.heights).tolist()
-    left = [1.0 - (strain[i] - max(star, 0.0)) for i, star, _ in _poles(scene, arrays)]
+def _distance(scene: Plan, arrays: ChainArrays, motion: Motion) -> float:
+    """Return the least distance, in strain, of any spring from 1 + ε_* at a sample; at most 1."""
+    strain = np.diff(motion.displacement, axis=0, prepend=0.0).max(axis=1) / arrays.heights
+    left = [1.0 - (strain.item(i) - max(star, 0.0)) for i, star, _ in _poles(scene, arrays)]
     return float(min([1.0, *left]))
 
 
@@ -242,27 +245,6 @@ def _distance_by_stress(scene: Plan, arrays: ChainArrays, motion: Motion) -> flo
     end of a branch between two samples.
     """
     return min([1.0, *(kc / (kc + motion.strongest) for _, _, kc in _poles(scene, arrays))])
-
-
-def _distance_at_peak(scene: Plan, arrays: ChainArrays, motion: Motion, rtol: float) -> float:
-    """Return the least distance of a strain from the end of its branch, peak of an impact included.
-
-    The peak of a fast impact may lie between two samples, so it is bracketed.
-    """
-    rows, heights = arrays.rows, arrays.heights
-    distance = _distance(scene, arrays, motion.displacement)
-    if scene.solver == plans.CLOSED_FORM or scene.speed == 0.0 or not _hard(scene, arrays):
-        return distance
-    low, high = 0.0, float(scene.time[-1])
-    for _ in range(12):
-        grid = np.linspace(low, high, 201)
-        top = scene._replace(time=grid).run(rows, heights, rtol).displacement
-        distance = min(distance, _distance(scene, arrays, top))
-        at = int(top[-1].argmax())
-        low, high = float(grid[max(at - 1, 0)]), float(grid[min(at + 1, 200)])
-        if high - low < 1e-15 * high or at == 200:
-            break
-    return distance
 
 
 @dataclass(frozen=True, eq=False)

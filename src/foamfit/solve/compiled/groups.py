@@ -14,7 +14,7 @@ import math
 
 from foamfit.solve.compiled import motion
 from foamfit.solve.compiled.run import call_inside, grouping, numbers, spring
-from foamfit.solve.compiled.static import put, root, strain_at
+from foamfit.solve.compiled.static import elongation_at, root
 from foamfit.solve.scene import STRESS, VISCOUS
 from foamfit.springs.compiled.contract import inner, past
 
@@ -93,22 +93,15 @@ def solve_loose(c, g, i0, i1, reach, push, y):
             flat = i
     if not some:
         return
-    if g == c.groups - 1 and c.top == STRESS:
-        common = push
-    elif flat >= 0:
-        s = spring(c, flat)
-        common = s.gain * s.sigma_high + s.offset
-    else:
+    pushed = g == c.groups - 1 and c.top == STRESS
+    if not pushed and flat < 0:
         root(c, i0, i1, rest, common, -math.inf, math.inf, 0, 1)
         return
-    for i in range(i0, i1):
-        s = spring(c, i)
-        if s.eta == 0.0 and i != flat:
-            put(c, i, strain_at(c, i, common), common)
-            rest -= s.height * s.eps
-    if flat >= 0 and not (g == c.groups - 1 and c.top == STRESS):
-        s = spring(c, flat)
-        s.eps = rest / s.height
+    s = spring(c, max(flat, i0))
+    eps, common = s.eps, push if pushed else s.gain * s.sigma_high + s.offset
+    total, _, _ = elongation_at(c, i0, i1, common, 1)
+    if flat >= 0:
+        s.eps = eps if pushed else s.eps + (rest - total) / s.height
 
 
 @inner

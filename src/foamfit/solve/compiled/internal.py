@@ -57,20 +57,15 @@ def _path(c, i):
 def _part(c, i, y, part):
     """Fill the derivatives at fixed strain, by direction, and those of the stress."""
     n, p, x = numbers(c, i), c.p, numbers(c, i).internals
-    evaluate(c, i, contract.PATHS if n.fixed else 1)  # at the strain rate found since
-    last = contract.last_point(spring(c, i).by, x)
+    if spring(c, i).lossy > 0.0:  # at the strain rate found since
+        evaluate(c, i, contract.PATHS if n.fixed else 1)
     for j in range(p):
-        out, fresh = toward(c, i, j), last.derived == 0.0
+        out = toward(c, i, j)
         change, own = past(out, 2 + 2 * x), c.directions[2 * j + 1]
         for k in range(x):
-            value = y[c.base + (n.x_at + k) * p + j]
-            fresh = fresh or value != change[k]
-            change[k] = value
-        if fresh:
-            own = own if c.directions[2 * j] == i and 0 <= own < OWN_ETA else -1
-            direct(c, i, change, own, out)
+            change[k] = y[c.base + (n.x_at + k) * p + j]
+        direct(c, i, change, own if c.directions[2 * j] == i and 0 <= own < OWN_ETA else -1, out)
         part[j] = out[0]
-    last.derived = 1.0
 
 
 @inner

@@ -33,9 +33,9 @@ takes x for the stress and fills ε(x) - ε in MISS. An INTERNAL one has interna
     dx/dt = A dε/dt + B,        σ = σ(ε, x) + V(ε, x, dε/dt);
 
 `evaluate` fills them for one point, from BY on: σ, V, A and B, and their derivatives by ε; with
-`want` = PATHS along A and along B, with `want` > 0 that of V by dε/dt. A point evaluated before is
-not evaluated again. With `want` = DIRECTION it fills `out` with the derivatives of σ, V, A and B at
-the last point, at fixed strain, by dx (`x`) and, unless `count` is negative, by parameter `count`.
+`want` = PATHS along A and along B, with `want` > 0 that of V by dε/dt. With `want` = DIRECTION it
+fills `out` with the derivatives of σ, V, A and B at the present point, at fixed strain, by dx (`x`)
+and, unless `count` is negative, by parameter `count`.
 """
 
 from __future__ import annotations
@@ -83,14 +83,11 @@ TINY = 1e-300  # dashpot of a law with V that has none: it counts as damped
 OF_STRESS, OF_HELD, OF_PARAMETER = 0, 1, 3  # columns of the derivatives of `switch`
 EXPLICIT, BY_STRESS, INTERNAL = range(3)
 
-# Of an INTERNAL law: `want`, and what its last point was evaluated with. Its results, see
-# `results_of`: rows of 2 + 2 x numbers; the last point, which has x more numbers; the derivatives
-# of `switch`; and for each direction of the solver its derivatives and dx.
+# Of an INTERNAL law: `want`. Its results, see `results_of`: rows of 2 + 2 x numbers; derivatives of
+# `switch`; and for each direction of the solver its derivatives and dx.
 PATHS, DIRECTION = 2, 3
 BY_STRAIN, ALONG_A, ALONG_B, BY_RATE = range(1, 5)  # rows; the last has one number
 STILL, FADES, FLOWS = range(3)  # internal variables and V: nothing, x decays, or anything else
-_LAST = ("wanted", "derived", "eps", "rate", "branch")  # of the last point; then x
-POINT = len(_LAST)
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy", "fastmath": {"contract"}, "no_rewrites": True,
 }  # fmt: skip
@@ -227,21 +224,14 @@ EVALUATE = 1  #: place among the addresses
 def results_of(parameters: int, internal: int, directions: int = 0) -> int:
     """Return the number of columns of `evaluate`, and of `switch` after them."""
     held = parameters + 2 * (OF_PARAMETER + parameters)
-    rows = BY_RATE * (2 + 2 * internal) + 1 + POINT + internal
-    rows += (internal + 1) * (1 + internal + parameters)
+    rows = BY_RATE * (2 + 2 * internal) + 1 + (internal + 1) * (1 + internal + parameters)
     return BY + max(held, rows + directions * (2 + 3 * internal))
 
 
 @inlined
-def last_point(values, x):
-    """Return the last point of an INTERNAL law, behind its values."""
-    return _as_point(past(values, BY_RATE * (2 + 2 * x) + 1))
-
-
-@inlined
 def changes_of(values, x):
-    """Return the derivatives of `switch` of an INTERNAL law."""
-    return past(last_point(values, x), POINT + x)
+    """Return the derivatives of `switch` of an INTERNAL law, behind its values."""
+    return past(values, BY_RATE * (2 + 2 * x) + 1)
 
 
 @intrinsic
@@ -293,7 +283,6 @@ def naming(name: str, fields: Sequence[str]) -> Any:
     return pointing(Named(name, REAL, {field: k for k, field in enumerate(fields)}))
 
 
-_as_point = naming("Point", _LAST)
 complexes_at, as_spring = pointing(types.CPointer(types.complex128)), pointing(SPRING)
 
 

@@ -94,28 +94,20 @@ def bound(row, s, point, found):
 
 
 @inner
-def bound_stress(row, s, point, found):
-    """Set the stresses at the ends of the branch of an EXPLICIT law."""
-    low, high = -math.inf, math.inf
-    if s.low > -math.inf:
+def enter(row, s):
+    """Set the ends of a branch at its beginning; the stresses there of an EXPLICIT law."""
+    point, found = gather(row, s, s.eps, s.xs)
+    bound(row, s, point, found)
+    low, high, explicit = -math.inf, math.inf, s[KIND] == EXPLICIT
+    if explicit and s.low > -math.inf:
         point[0] = complex(s.low, STEP)
         low, _ = stress_of(row, s, point, found)
-    if s.high < math.inf:
+    if explicit and s.high < math.inf:
         point[0] = complex(s.high, STEP)
         high, _ = stress_of(row, s, point, found)
     if abs(high - low) < 1e-14 * max(abs(low), abs(high)):  # a flat branch without rounding
         high = low
     s.sigma_low, s.sigma_high = low, high
-
-
-@inner
-def enter(row, s):
-    """Set the ends of a branch at its beginning."""
-    point, found = gather(row, s, s.eps, s.xs)
-    bound(row, s, point, found)
-    s.sigma_low, s.sigma_high = -math.inf, math.inf
-    if s[KIND] == EXPLICIT:
-        bound_stress(row, s, point, found)
 
 
 @contract.beginning
@@ -150,20 +142,6 @@ def evaluate_explicit(row, s, eps, n, want, out):
 
 
 @inner
-def is_last(s, eps, x, want, point):
-    """Whether an INTERNAL law was evaluated here last; else note that it is."""
-    same = want < point.wanted and eps == point.eps and s.branch == point.branch
-    same = same and (s[DAMPS] == 0.0 or s.rate == point.rate)
-    for k in range(int(s[INSIDE])):
-        same = same and x[k] == point[contract.POINT + k]
-        point[contract.POINT + k] = x[k]
-    if not same:
-        point.wanted, point.derived, point.eps = want + 1.0, 0.0, eps
-        point.rate, point.branch = s.rate, s.branch
-    return same
-
-
-@inner
 def derive_along(s, point, found, dx, own, out):
     """Fill derivatives of σ, V, A and B by dx and, unless negative, parameter `own`."""
     inside, total = int(s[INSIDE]), 1.0 if own >= 0 else 0.0
@@ -187,12 +165,10 @@ def derive_along(s, point, found, dx, own, out):
 def evaluate_internal(row, s, eps, x, own, want, out):
     """Fill the results of an INTERNAL law."""
     inside, values = int(s[INSIDE]), past(out, BY)
-    size, last = 2 + 2 * inside, contract.last_point(values, inside)
+    size = 2 + 2 * inside
     if want == contract.DIRECTION:
         point, found = gather(row, s, s.eps, s.xs)
         derive_along(s, point, found, x, own, out)
-        return
-    if is_last(s, eps, x, want, last):
         return
     point, found = gather(row, s, eps, x)
     point[0] = complex(eps, STEP)
