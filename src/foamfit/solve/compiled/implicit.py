@@ -323,17 +323,12 @@ def _finish(c, h, at, want):
 @inner
 def _guess(c, h, last):
     """Extrapolate the polynomial of the step before, of length `last` (0: none)."""
-    wide, total = c.wide, c.base + c.carries * c.p
+    wide, total, known = c.wide, c.base + c.carries * c.p, 0.0 < h <= 2.0 * last
     for i in range(POINTS):
-        move = past(c.stage, (POINTS + 1 + i) * wide)
-        if not 0.0 < h <= 2.0 * last:
-            for k in range(total):
-                move[k] = NODES[i] * h * c.stage[k] if last < 0.0 else 0.0
-            continue
-        x = 1.0 + NODES[i] * h / last
+        move, x = past(c.stage, (POINTS + 1 + i) * wide), 1.0 + NODES[i] * h / last
         for k in range(total):
             value = whole = 0.0
-            for q in range(POINTS - 1, -1, -1):
+            for q in range(POINTS - 1 if known else -1, -1, -1):
                 value = (value + c.line[q * wide + k]) * x
                 whole += c.line[q * wide + k]
             move[k] = value - whole

@@ -20,10 +20,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from llvmlite import ir
 from numba import types
-from numba.core.typing.templates import AttributeTemplate
-from numba.extending import infer_getattr, lower_getattr_generic, models, register_model
 
 from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import REAL, REALS_AT, WHOLE, address, inner, past, start
@@ -115,56 +112,19 @@ STAGES, STEPPED, LINE = 16, 12, 7
 POINTS, SYSTEMS = 5, 3  # of an implicit step; linear systems, one for a pair of eigenvalues
 
 
-class Run(types.Type):  # type: ignore[misc]
-    """The type of the record in compiled functions."""
-
-    def __init__(self) -> None:
-        """Give the type its name."""
-        super().__init__("foamfit.Run")
-
-
-RECORD = Run()
-register_model(Run)(models.OpaqueModel)
-
-
 def _named(name: str, kind: Any, fields: tuple[str, ...]) -> Any:
     return contract.Named(name, kind, {field: k for k, field in enumerate(fields)})
 
 
 _NUMBERS = _named("Numbers", WHOLE, NUMBERS)
-_TYPES = {
+_COMPLEXES_AT = types.CPointer(types.complex128)
+_KINDS = {
+    **dict.fromkeys((*FLOATS, *GIVEN), REALS_AT), **dict.fromkeys(INTEGERS, contract.WHOLES_AT),
     "springs": contract.SPRING, "numbers": _NUMBERS, "drive": _named("Drive", REAL, DRIVE),
-    "now": _named("Now", REAL, NOW),
+    "now": _named("Now", REAL, NOW), "systems": _COMPLEXES_AT, "right": _COMPLEXES_AT,
 }  # fmt: skip
+RECORD = contract.Named("Run", WHOLE, AT, _KINDS)
 _as_numbers, _as_record = contract.pointing(_NUMBERS), contract.pointing(RECORD)
-
-
-def _type_of(name: str) -> Any:
-    """Return the type of a field of the record."""
-    if name in _TYPES:
-        return _TYPES[name]
-    if name in FLOATS or name in GIVEN:
-        return types.CPointer(types.complex128) if name in ("systems", "right") else REALS_AT
-    return contract.WHOLES_AT if name in INTEGERS else WHOLE
-
-
-@infer_getattr
-class _Fields(AttributeTemplate):  # type: ignore[misc]
-    """Types of the fields of a record."""
-
-    key = Run
-
-    def generic_resolve(self, run: Any, name: str) -> Any:
-        """Return the type of a field, or None if the record has no such field."""
-        return _type_of(name) if name in AT else None
-
-
-@lower_getattr_generic(Run)
-def _field(context, builder, typ, value, name):
-    """Load a field."""
-    kind = context.get_value_type(_type_of(name))
-    first = builder.bitcast(value, kind.as_pointer())
-    return builder.load(builder.gep(first, [ir.Constant(ir.IntType(64), AT[name])]))
 
 
 def _pointed(field: str, returns: Any, *takes: Any) -> tuple[Callable[..., contract.Pointed], Any]:
@@ -175,7 +135,7 @@ def _pointed(field: str, returns: Any, *takes: Any) -> tuple[Callable[..., contr
     signature = returns(RECORD, *takes)
 
     def emit(context, builder, given, args):
-        where = _field(context, builder, RECORD, args[0], field)
+        where = contract.load(context, builder, RECORD, args[0], field)
         return contract.by_address(context, builder, given, [where, *args])
 
     return partial(contract.Pointed, signature), contract.emitted(signature, emit)

@@ -133,14 +133,18 @@ class Pointed:
 class Named(types.CPointer):  # type: ignore[misc]
     """A pointer to numbers some of which have a name: `s.eps` is `s[EPS]`.
 
-    Those of `arrays` are pointers to the numbers from a place on: `s.g[k]` is `s[RELAX + k]`.
+    Those of `arrays` are pointers to the numbers from a place on: `s.g[k]` is `s[RELAX + k]`. Whole
+    numbers may be addresses, `kinds` are then the types of the pointers: `c.springs`.
     """
 
-    def __init__(self, name: str, kind: Any, places: Mapping[str, int], **arrays: int) -> None:
+    def __init__(
+        self, name: str, kind: Any, places: Mapping[str, int],
+        kinds: Mapping[str, Any] | None = None, **arrays: int,
+    ) -> None:  # fmt: skip
         """Give the names of numbers, and of arrays, with their places."""
         super().__init__(kind)
         self.name, self.places = f"foamfit.{name}", {**places, **arrays}
-        self.arrays = frozenset(arrays)
+        self.kinds, self.arrays = kinds or {}, frozenset(arrays)
 
     @property
     def key(self) -> str:
@@ -161,7 +165,7 @@ class _Names(AttributeTemplate):  # type: ignore[misc]
         """Return the type of a named number or array, or None if the name is unknown."""
         if name in pointer.arrays:
             return types.CPointer(pointer.dtype)
-        return pointer.dtype if name in pointer.places else None
+        return pointer.kinds.get(name, pointer.dtype) if name in pointer.places else None
 
 
 def _place(builder: Any, kind: Any, pointer: Any, name: str) -> Any:
@@ -169,9 +173,12 @@ def _place(builder: Any, kind: Any, pointer: Any, name: str) -> Any:
 
 
 @lower_getattr_generic(Named)
-def _load(context, builder, kind, pointer, name):
+def load(context, builder, kind, pointer, name):
+    """Load a named number or pointer."""
     place = _place(builder, kind, pointer, name)
-    return place if name in kind.arrays else builder.load(place)
+    value = place if name in kind.arrays else builder.load(place)
+    turned = name in kind.kinds
+    return builder.inttoptr(value, context.get_value_type(kind.kinds[name])) if turned else value
 
 
 @lower_setattr_generic(Named)

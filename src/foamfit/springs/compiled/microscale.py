@@ -150,21 +150,12 @@ def _hold(row, s, rank):
 
 
 @inner
-def rank_now(row, s):
-    """Return the rank up to which micro-springs have snapped."""
-    branch = int(s.branch)
-    if not mix.moves(branch):
-        return s.rank
-    place, scale = mix.line(row, branch)
-    return (math.log(s.x) - place) / scale
-
-
-@inner
 def _turn(row, s, up, out):
     """Hold the rank that a spring has reached where its strain turns."""
-    branch, remembers, rank = s.branch, row.remembers > 0.0, rank_now(row, s)
+    branch, remembers = s.branch, row.remembers > 0.0
     first = 5 if branch == BACK else 3
-    _, scale = mix.line(row, int(branch))
+    place, scale = mix.line(row, int(branch))
+    rank = (math.log(s.x) - place) / scale
     for h in range(2 if branch == SNAP and remembers else 1):
         by = past(out, h * mix.CHANGE)
         by[contract.OF_HELD + h], by[contract.OF_STRESS] = 0.0, 1.0 / (scale * s.x)

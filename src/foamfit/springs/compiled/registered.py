@@ -129,8 +129,6 @@ def evaluate_explicit(row, s, eps, n, want, out):
         point[0] = complex(eps[j], STEP)
         ask(s, point, VALUES, found)
         out[contract.OF_LAW * n + j], out[SLOPE * n + j] = found[0].real, found[0].imag / STEP
-        for c in range(contract.MISS, BY):
-            out[c * n + j] = 0.0
         if want == 0:
             continue
         point[0] = complex(eps[j], 0.0)
