@@ -18,7 +18,7 @@ from foamfit.errors import SimulationError
 from foamfit.solve import cache
 
 LOOPS = ("follow", "integrate")
-SECOND = "from foamfit.solve.precompile import compile_second; compile_second()"
+SECOND = "from foamfit.solve.precompile import compile_half; compile_half(True)"
 LONGEST = 300.0  # s that the second process may take
 
 
@@ -40,20 +40,16 @@ def run(loop: str, model: str = "microscale") -> None:
             scene.run(*chain.arrays[:2], 1e-2, directions=np.zeros((1, 2), np.int64))
 
 
-def compile_first() -> None:
-    """Compile the rates of the state and the explicit step."""
-    from foamfit.solve.compiled import events, explicit, motion
-
-    for one in (motion.compute_rates, events.enter_branch, explicit.step):
-        one.compiled  # noqa: B018
-
-
-def compile_second() -> None:
-    """Compile what passes events and writes samples."""
-    from foamfit.solve.compiled import loop, samples
+def compile_half(second: bool) -> None:
+    """Compile rates of the state and explicit steps; the second: what passes events and writes."""
+    from foamfit.solve.compiled import events, explicit, loop, motion, samples
 
     gc.disable()
-    for one in (loop.advance, samples.sample_task):
+    halves = (
+        (motion.compute_rates, events.enter_branch, explicit.step),
+        (loop.advance, samples.sample_task),
+    )
+    for one in halves[second]:
         one.compiled  # noqa: B018
 
 
@@ -85,7 +81,7 @@ def compile_solver(model: str = "bistable", announce: Callable[[], None] | None 
     gc.disable()  # a fifth of the time
     try:
         with _second_process():
-            compile_first()
+            compile_half(False)
             run("follow", model)
         run("integrate", model)  # it needs what the second process has compiled
     finally:

@@ -117,11 +117,11 @@ def _named(name: str, kind: Any, fields: tuple[str, ...]) -> Any:
 
 
 _NUMBERS = _named("Numbers", WHOLE, NUMBERS)
-_COMPLEXES_AT = types.CPointer(types.complex128)
 _KINDS = {
     **dict.fromkeys((*FLOATS, *GIVEN), REALS_AT), **dict.fromkeys(INTEGERS, contract.WHOLES_AT),
     "springs": contract.SPRING, "numbers": _NUMBERS, "drive": _named("Drive", REAL, DRIVE),
-    "now": _named("Now", REAL, NOW), "systems": _COMPLEXES_AT, "right": _COMPLEXES_AT,
+    "now": _named("Now", REAL, NOW),
+    **dict.fromkeys(("systems", "right"), contract.COMPLEXES_AT),
 }  # fmt: skip
 RECORD = contract.Named("Run", WHOLE, AT, _KINDS)
 _as_numbers, _as_record = contract.pointing(_NUMBERS), contract.pointing(RECORD)

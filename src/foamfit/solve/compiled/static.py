@@ -20,7 +20,7 @@ MOST_SWITCHES = 100_000  # of all springs between two samples
 
 
 @inner
-def put(c, i, eps, sigma):
+def _put(c, i, eps, sigma):
     """Bring a spring to a strain and stress of its branch."""
     s = spring(c, i)
     s.eps = eps
@@ -47,7 +47,7 @@ def elongation_at(c, i0, i1, sigma, loose):
         if loose and s.eta > 0.0:
             continue
         eps = strain_at(c, i, sigma)
-        put(c, i, eps, sigma)
+        _put(c, i, eps, sigma)
         total += s.height * eps
         compliance += s.height * s.soft / s.gain
         size += s.height * max(abs(eps), LEAST)
@@ -65,7 +65,7 @@ def _split_jump(c, i0, i1, target, low, high, loose):
             continue
         upper, eps = strain_at(c, i, high), strain_at(c, i, low)
         gain = min(max(rest / s.height, 0.0), upper - eps)
-        put(c, i, eps + gain, 0.5 * (low + high))
+        _put(c, i, eps + gain, 0.5 * (low + high))
         rest -= s.height * gain
     return 0.5 * (low + high)
 
@@ -126,7 +126,7 @@ def push_to(c, i, sigma, before, y):
             change_branch(c, i, int(c.none), y)
         else:
             break
-    put(c, i, strain_at(c, i, sigma), sigma)
+    _put(c, i, strain_at(c, i, sigma), sigma)
 
 
 @inner

@@ -110,6 +110,7 @@ if (_stats := getattr(outer(_nothing), "stats", None)) is not None:  # None: num
 
 REAL, WHOLE = types.float64, types.int64
 REALS_AT, WHOLES_AT = types.CPointer(REAL), types.CPointer(WHOLE)
+COMPLEXES_AT = types.CPointer(types.complex128)
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,7 +291,7 @@ def naming(name: str, fields: Sequence[str]) -> Any:
     return pointing(Named(name, REAL, {field: k for k, field in enumerate(fields)}))
 
 
-complexes_at, as_spring = pointing(types.CPointer(types.complex128)), pointing(SPRING)
+complexes_at, as_spring = pointing(COMPLEXES_AT), pointing(SPRING)
 
 
 def by_address(context, builder, signature, args):

@@ -34,8 +34,8 @@ VALUES, ENDS, DOWN, UP = range(4)
 # What a spring of a registered law keeps in memory: the address of its function, kind, numbers of
 # parameters and of internal variables, whether its branches end, and whether V depends on the rate.
 FORMULAS, KIND, COUNT, INSIDE, BOUNDED, DAMPS = range(contract.OWN, contract.OWN + 6)
-COMPLEXES = types.CPointer(types.complex128)
-FORMULA = contract.WHOLE(COMPLEXES, contract.WHOLE, contract.WHOLE, COMPLEXES)
+_AT, _LONG = contract.COMPLEXES_AT, contract.WHOLE
+FORMULA = _LONG(_AT, _LONG, _LONG, _AT)
 FURTHEST, TRIALS = 1e12, 200  # largest strain, and trials, in the search for a strain
 
 
@@ -326,7 +326,7 @@ def _tuple_at(count: int) -> Any:
             at = [builder.gep(args[0], [ir.Constant(ir.IntType(64), k)]) for k in range(count)]
             return context.make_tuple(builder, kind, [builder.load(one) for one in at])
 
-        return kind(COMPLEXES), emit
+        return kind(contract.COMPLEXES_AT), emit
 
     return load
 
