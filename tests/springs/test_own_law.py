@@ -144,7 +144,7 @@ def test_derivatives_are_exact(bouc_wen: Law, drive: str, place: str) -> None:
     time = (3.0 if drive == "impact" else 100.0) * TIME
 
     def run(values: np.ndarray, rtol: float, **more: object) -> ff.Response:
-        own = bouc_wen.make((*values, 30.0), ((0.3, 2e-4),))
+        own = bouc_wen.make((*values[:4], 30.0), ((values[4], 2e-4),))
         above, masses = ff.LinearSpring(4e6, eta=500.0), [2e-3, 0.0]
         chain = (
             chain_of(own)
@@ -153,10 +153,10 @@ def test_derivatives_are_exact(bouc_wen: Law, drive: str, place: str) -> None:
         )
         return ff.simulate(chain, given, time, rtol, **more)  # type: ignore[arg-type]
 
-    values = np.array(VALUES[:4])
-    found = run(values, 1e-9, sensitivities=[f"s1_{name}" for name in bouc_wen.own])
-    for i, name in enumerate(bouc_wen.own):
-        one = np.arange(4) == i
+    values, names = np.array([*VALUES[:4], 0.3]), (*bouc_wen.own, "g1")
+    found = run(values, 1e-9, sensitivities=[f"s1_{name}" for name in names])
+    for i, name in enumerate(names):
+        one = np.arange(5) == i
         moved, stress = differences(
             lambda by, one=one: run(values + by * one, 1e-11), 2e-3 * values[i]
         )
