@@ -113,17 +113,25 @@ def condition(
     if is_velocity(whole) and (impact or "stress" in whole.derived):  # else it shows its noise
         velocity = whole.curves("velocity")["velocity"]
         noise["displacement"] = noise_of_integral(whole.instants, velocity)
-    # Without time a rise counts samples from the first row kept, each of which is `block` rows.
+    # Without time, from the first row kept
     zero = 0.0 if used.place else whole.origins.get("contact_time", float(span.first))
-    size = block if whole.time is None else 1
     test = _measured(
         whole, record, block, excess, specimen=specimen, striker=striker and given, flight=flight,
         noise=replace(_stated_of_blocks(stated, levels, whole, block), estimated=noise),
         contact="stress" if used.place else start.by, cycle=used.number, last_cycle=used.last,
         cycles=tuple(cycle.number for cycle in found) or (1,),
-        rise=rise and ((rise[0] - zero - 0.5 * (size - 1)) / size, rise[1] / size),
+        rise=rise and _on_clock(rise, whole, block, zero),
     )  # fmt: skip
     return with_gravity(test) if impact else test
+
+
+def _on_clock(rise: contact.Kink, record: Record, block: int, zero: float) -> contact.Kink:
+    """Return a rise on the clock of the samples, which begins at `zero`.
+
+    Without time it counts samples, each of which is `block` rows.
+    """
+    size = block if record.time is None else 1
+    return (rise[0] - zero - 0.5 * (size - 1)) / size, rise[1] / size
 
 
 def _stated_of_blocks(stated: Noise, levels: contact.Levels, record: Record, block: int) -> Noise:
