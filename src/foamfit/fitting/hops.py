@@ -7,7 +7,6 @@ few descents from start values end in the best minimum. There the hops also comb
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from operator import itemgetter
 
 import numpy as np
@@ -15,7 +14,6 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.fitting.box import Space
 from foamfit.fitting.levenberg import Iterate, descend
-from foamfit.fitting.objective import Objective
 from foamfit.fitting.starts import inner_part
 from foamfit.springs.model import exchanges
 
@@ -25,11 +23,10 @@ End = tuple[float, Array]  # cost and coordinates of the end of a descent
 Way = Callable[[Space, Array, Array, np.random.Generator], Array]  # from two points to a child
 
 ALIKE = 1e-3  # relative difference of the costs of descents that ended in one minimum
-# Samples to each side from which the local slope of a loop is taken, and its limits over the mean.
-NEARBY, LEAST_SLOPE, LARGEST_SLOPE = 3, 0.02, 20.0
 # Ends that are combined, and the least relative difference of their costs; failures in a row after
-# which this stops.
-POOL, DIFFERENT, PATIENCE = 12, 0.01, 120
+# which this stops: if the best end was found several times; else, or once a hop ended better; and
+# of springs in series along the loop, from which they go on.
+POOL, DIFFERENT, SHORT, LONG, ON_LOOP = 12, 0.01, 40, 160, 120
 # Stages of the descent from a child: iterations, relative gain at which it ends, and largest cost,
 # over the best one, with which it goes on.
 STAGES = ((5, ALIKE, 5.0), (7, ALIKE, 1.5), (40, 1e-5, np.inf))
@@ -46,48 +43,13 @@ def grouped(ends: Sequence[End], alike: float) -> list[list[End]]:
     return groups
 
 
-def under_stress(along: Objective, space: Space) -> Way:
-    """Return a way to a child that descends along the motion under the measured stress of a loop.
-
-    Under one stress the elongations of springs in series add up: each bends the curve at stresses
-    of its own. A descent there has other wrong minima than one along the motion, whose objective is
-    `along`. Each elongation that is missed is multiplied by the local slope of the loop, so that it
-    counts as the stress that is missed.
-    """
-    test = along.measurement
-    assert test.displacement is not None
-    assert test.stress is not None
-    motion, stress = test.displacement, test.stress
-    span, at = float(np.ptp(motion)), np.arange(motion.size)
-    under = Objective(
-        replace(test, noise=replace(test.noise, displacement=span)), along.model, "stress",
-        {"displacement_time": 1.0}, nuisance=(), spent=along.spent,
-    )  # fmt: skip
-    ahead, behind = np.minimum(at + NEARBY, at[-1]), np.maximum(at - NEARBY, 0)
-    run = np.maximum(np.abs(motion[ahead] - motion[behind]), 1e-9 * span) / span
-    slope = np.abs(stress[ahead] - stress[behind]) / run / np.ptp(stress)
-    weight = np.clip(slope, LEAST_SLOPE, LARGEST_SLOPE) * along.span("stress_strain")
-    weight, count = weight[under.kept["displacement_time"]], len(along.model.names)
-
-    def residual(point: Array) -> Array:
-        return np.asarray(weight * under.residual(space.decode(point)[:count]))
-
-    def jacobian(point: Array) -> Array:
-        values = space.decode(point)
-        moves = space.slopes(point, values)[:count]
-        return np.asarray(weight[:, None] * under.jacobian_along(values[:count], moves))
-
-    def stretched(_: Space, one: Array, *_others: object) -> Array:
-        return descend(residual, jacobian, one, space.box, 15, enough=ALIKE).point
-
-    return stretched
-
-
 def hop(
     space: Space, ends: Sequence[End], functions: Functions, rng: np.random.Generator,
-    *more: Way, patience: int = PATIENCE,
+    *more: Way, patience: int, most: int,
 ) -> list[End]:  # fmt: skip
     """Descend from children of the best ends until `patience` in a row are no better.
+
+    Once one was better, this takes `most` in a row.
 
     `functions` are the residual and its derivative; `WAYS`, for springs in series `IN_SERIES`
     too, and `more` of them say how a child is made of two ends. Return all ends.
@@ -98,8 +60,8 @@ def hop(
         best = pool[0][0]
         one, other = (pool[int(len(pool) * rng.random() ** 2)][1] for _ in range(2))
         child = ways[rng.integers(len(ways))](space, one, other, rng)
+        failed += 1
         if np.array_equal(child, one):
-            failed += 1
             continue
         at: Array | Iterate = child
         for iterations, enough, hopeful in STAGES:
@@ -107,7 +69,8 @@ def hop(
             if end.cost > hopeful * best:
                 break
         out.append((end.cost, end.point))
-        failed = 0 if end.cost < (1.0 - ALIKE) * best else failed + 1
+        if end.cost < (1.0 - ALIKE) * best:
+            failed, patience = 0, most
         pool = [group[0] for group in grouped([*pool, out[-1]], DIFFERENT)][:POOL]
     return out
 
