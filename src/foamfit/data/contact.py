@@ -15,6 +15,10 @@ from foamfit.data.noise import MIN_REST, noise_about, polynomial_at, smooth
 # the loading branches differ by a smaller factor (6 in the published sets), so a soft start is not
 # mistaken for rest. The limit is larger for a motion, and for an impact, whose fit refines it.
 STILL, _STILL_IMPACT, STILL_MOTION = 0.15, 0.3, 0.5
+# Largest deviation of a rest from its line, as a share of the range of a stress or a motion. A hold
+# after a step or a preload deviates more.
+_WANDERS, _MOTION_WANDERS = 0.01, 0.025
+_STRAIGHT = 0.005  # RMS deviation of a motion from a line, as a share of its range
 _LINE = 5  # smallest number of rows for a line
 _ERRORS = 2.0  # standard errors added to the slope at rest
 # Largest drift of an impact's stress at rest, as a share of the peak: without a motion; if the
@@ -131,13 +135,15 @@ def _onset(time: Array, values: Array, noise: NoiseLevel) -> Kink | None:
 
 
 def leave_rest(
-    time: Array, values: Array, noise: NoiseLevel, still: float = STILL, drift: float = np.inf
-) -> Kink | None:
+    time: Array, values: Array, noise: NoiseLevel,
+    still: float = STILL, drift: float = np.inf, wanders: float = np.inf,
+) -> Kink | None:  # fmt: skip
     """Find where a signal leaves its rest; None if there is no rest before the rise.
 
     A line is extrapolated back from the first part of the rise. At rest the slope, plus two
     standard errors, is less than a share `still` of the mean slope up to 15 % of the peak, and the
-    signal does not change significantly by more than `drift`. A kink within a rise is skipped.
+    signal does not change significantly by more than `drift`, nor leave a line by more than the
+    share `wanders` of its range. A kink within a rise is skipped.
     """
     rows = len(time)
     while rows >= 10 and (found := _onset(time[:rows], values[:rows], noise)):
@@ -152,7 +158,9 @@ def leave_rest(
         high = high if t[high] > at else int(np.argmax(y))
         after = float(y[high : high + 3].mean() - rest) / (t[high] - at)
         changed = (size - _ERRORS * error) * (t[n - 1] - t[0])
-        if size + _ERRORS * error < still * after and changed <= drift:
+        off = smooth(y[:n] - rest - slope[1].value * (t[:n] - t[:n].mean()), 1 + n // 100)
+        steady = np.abs(off).max() <= max(wanders * np.ptp(y), 5.0 * noise.sigma)
+        if steady and size + _ERRORS * error < still * after and changed <= drift:
             return found
         rows = n
     return None
@@ -163,13 +171,24 @@ def _at_kink(channel: str, time: Array, at: Kink, by: str, what: str = "rest") -
     return Start(how, at[0], int(np.searchsorted(time, at[0])), at[1], by, free=True)
 
 
+def straight(time: Array, w: Array, first: int, rows: int, noise: NoiseLevel) -> int:
+    """Return the number of rows, at most `rows`, in which a motion follows a straight line."""
+    most = max(3.0 * noise.sigma, _STRAIGHT * float(np.ptp(w)))
+    while rows > _LINE:
+        t, y = time[first : first + rows] - time[first], w[first : first + rows]
+        if np.std(y - np.polyval(np.polyfit(t, y, 1), t)) <= most:
+            break
+        rows = max(_LINE, rows // 2)
+    return rows
+
+
 def _first_motion(time: Array, w: Array, noise: NoiseLevel) -> tuple[float, bool]:
     """Return the initial value of a motion, from a line, and whether it is clearly not zero."""
     top = int(np.argmax(w))
-    early = slice(0, max(_LINE, top // 12))
+    early = slice(0, straight(time, w, 0, max(_LINE, top // 12), noise))
     first = polynomial_at(time[early], w[early], time[0], noise)[0]
     least = max(ELSEWHERE * first.error, 0.02 * (float(w[top]) - first.value))
-    return first.value, abs(first.value) > least
+    return first.value, top >= 5 and abs(first.value) > least  # not with fewer samples
 
 
 def first_contact(record: Record) -> Record:
@@ -212,9 +231,11 @@ def start_of_impact(record: Record, levels: Levels, *, late: bool = False) -> St
     flies = elsewhere if w is not None else record.velocity is not None
     if late and start.free:
         return start
-    up = slice(0 if w is None else int(np.argmax(w)) + 1)
-    if w is not None and (at := leave_rest(time[up], w[up], levels["displacement"], STILL_MOTION)):
-        if not start.free or at[1] < start.error:
+    if w is not None and (at := motion_leaves_rest(record, levels)):
+        up = slice(int(np.argmax(w)) + 1)
+        # A motion that starts far from the onset of the stress is not due to contact.
+        alike = abs(at[0] - start.time) < 0.1 * (time[up][-1] - start.time)
+        if not start.free or (at[1] < start.error and alike):
             start = _at_kink("displacement", time, at, "motion")
     elif "stress" in record.derived and flies:  # the motion was recorded in flight
         below = np.flatnonzero(stress[: int(np.argmax(stress))] < _BRAKED * stress.max())
@@ -223,6 +244,13 @@ def start_of_impact(record: Record, levels: Levels, *, late: bool = False) -> St
         channel = "displacement" if w is not None else "velocity"
         start = _at_kink(channel, time, at, "motion", "line") if last else start
     return start
+
+
+def motion_leaves_rest(record: Record, levels: Levels) -> Kink | None:
+    """Find where the motion of an impact leaves its rest; None if it has none."""
+    w = record.curves()["displacement"]
+    up = slice(int(np.argmax(w)) + 1)
+    return leave_rest(record.instants[up], w[up], levels["displacement"], STILL_MOTION)
 
 
 def _at_first(time: Array) -> Start:
@@ -251,7 +279,7 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
     if w is not None:
         first, elsewhere = _first_motion(time, w, levels["displacement"])
     drift = np.inf if elsewhere else 0.01 * peak
-    at = leave_rest(time, stress, levels["stress"], drift=drift)
+    at = leave_rest(time, stress, levels["stress"], drift=drift, wanders=_WANDERS)
     start = _at_kink("stress", time, at, "stress") if at else None
     if w is None:
         return start or _at_first(time)
@@ -259,7 +287,7 @@ def start_of_slow_test(record: Record, levels: Levels) -> Start:
     if start and w[start.first] - first > _APPROACH * float(w[top] - w[start.first]):
         return replace(start, gauge="flight")
     up, noise = slice(top + 1), levels["displacement"]
-    if at := leave_rest(time[up], w[up], noise):
+    if at := leave_rest(time[up], w[up], noise, wanders=_MOTION_WANDERS):
         # Where a stress drives a foam with a dashpot, the motion follows it later.
         later = start and start.time + _LATER * float(np.hypot(start.error, at[1])) < at[0]
         if start and later and _has_risen(time, stress, start.first, at[0], levels["stress"]):

@@ -90,7 +90,7 @@ def condition(
     else:
         start = contact.start_of_slow_test(first, levels)
         end = len(first) if used.place else used.end - used.first
-        span = zeros.Span(start.first, end, end)
+        span = zeros.Span(start.first, end, start.resting, end)
     record = zeros.take_zeros(record, first, start, span, levels, impact=impact)
     if used.place:  # a later cycle has its own contact
         record = cycles.cut_to_reload(record, found, used, specimen.height)
@@ -101,7 +101,7 @@ def condition(
         record = cycles.cut_to_cycle(record, found, chosen) if chosen else record
         record = cut_to_contact(record, start, span)
     if impact:
-        record = zeros.mark_flight(record, start, span)
+        record = zeros.mark_flight(record, start, span, levels)
         record = start_within_height(integrate_motion(record, specimen, given), specimen, given)
     else:
         record = replace(integrate_motion(record, specimen, given), acceleration=None)

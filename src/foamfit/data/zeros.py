@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.data.contact import ELSEWHERE, Levels, Start
+from foamfit.data.contact import ELSEWHERE, Levels, Start, motion_leaves_rest, straight
 from foamfit.data.measurement import (
     GRAVITY,
     UNITS,
@@ -43,13 +43,14 @@ CONTRADICTED = "but the striker's velocity is given as"
 
 @dataclass(frozen=True)
 class Span:
-    """Rows around contact: `first` to `end` are kept.
+    """Rows around contact: `first` to `end` are kept, those before `rest` determine the zeros.
 
     Contact ends at the row `leaves`; `returned` is whether the stress has returned to zero there.
     """
 
     first: int
     end: int
+    rest: int
     leaves: int
     returned: bool = True
 
@@ -70,7 +71,9 @@ def span_of_impact(record: Record, start: Start, levels: Levels) -> Span:
     end = min(len(record), first + found + max(3, after)) if returned else len(record)
     # If few rows precede contact, half of them are kept and the others determine the zeros.
     lead = min(max(_LEAST_LEAD, found // 10), first // 2 if first >= 2 * _FEWEST else first)
-    return Span(first - lead, end, first + found, returned)
+    late = int(3 * start.error / float(np.median(np.diff(record.instants))))
+    rest = first - max(lead, min(late, 2 * first // 3))
+    return Span(first - lead, end, rest, first + found, returned)
 
 
 def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
@@ -111,7 +114,7 @@ def take_zeros(
     If too few rows precede the contact of an impact, the zero of the force is taken from the end of
     the record. If that is impossible, the zero of the file remains.
     """
-    errors, n = dict[str, float](), span.first if impact else start.resting
+    errors, n = dict[str, float](), span.rest
     for name, values in first.curves("acceleration").items():
         if name in record.derived:
             continue
@@ -217,6 +220,7 @@ def _zero_of_motion(
         return mean_level(values[:rows], noise), f"mean of {rows} samples at rest before contact"
     flies = top and start.gauge == "flight"
     reach = max(5, (int(np.argmax(values)) - first) // (24 if flies else 12))
+    reach = reach if impact else straight(time, values, first, reach, noise)
     near = slice(max(0, first - reach) if flies else first, first + reach)
     zero = polynomial_at(time[near], values[near], start.time, noise)[0]
     source = f"line through {zero.samples} samples {'around it' if flies else 'from there on'}"
@@ -248,7 +252,7 @@ def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker)
     return "other"
 
 
-def mark_flight(record: Record, start: Start, span: Span) -> Record:
+def mark_flight(record: Record, start: Start, span: Span, levels: Levels) -> Record:
     """Mark rows in which a gauge does not follow the striker or the specimen as not measured.
 
     After contact the specimen may stay on its base or leave with the striker: its interior motions
@@ -264,6 +268,8 @@ def mark_flight(record: Record, start: Start, span: Span) -> Record:
     moves = record.instants > max(2.5 * step, 2 * start.error)
     if start.gauge == "rest":
         moves &= touching
+        if at := motion_leaves_rest(record, levels):  # possibly late
+            moves &= record.instants > at[0] + max(2.5 * step, 2 * at[1])
     kept = record.sampled.get("displacement", np.ones(len(record), dtype=bool))
     return replace(record, sampled=record.sampled | {"displacement": kept & moves})
 
