@@ -329,9 +329,7 @@ def _search(
         space = problem.space()
         how: Any = {"rng": rng, "progress": progress, "known": known}
         costs = search.search(coarse, space, starts=record.starts, **how)
-        # Where the law of one spring errs, hops find as good minima.
-        if space.model.has_several or coarse.best_cost <= thinned.objective.floor:
-            scan_places(coarse, space)
+        scan_places(coarse, space)
         best = [] if coarse.best_values is None else [coarse.best_values]
         return costs, [*best, *coarse.ends]
 

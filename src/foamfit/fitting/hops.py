@@ -24,9 +24,8 @@ Way = Callable[[Space, Array, Array, np.random.Generator], Array]  # from two po
 
 ALIKE = 1e-3  # relative difference of the costs of descents that ended in one minimum
 # Ends that are combined, and the least relative difference of their costs; failures in a row after
-# which this stops: if the best end was found several times; else, or once a hop ended better; and
-# of springs in series along the loop, from which they go on.
-POOL, DIFFERENT, SHORT, LONG, ON_LOOP = 12, 0.01, 40, 160, 120
+# which this stops.
+POOL, DIFFERENT, PATIENCE = 12, 0.01, 120
 # Stages of the descent from a child: iterations, relative gain at which it ends, and largest cost,
 # over the best one, with which it goes on.
 STAGES = ((5, ALIKE, 5.0), (7, ALIKE, 1.5), (40, 1e-5, np.inf))
@@ -45,11 +44,9 @@ def grouped(ends: Sequence[End], alike: float) -> list[list[End]]:
 
 def hop(
     space: Space, ends: Sequence[End], functions: Functions, rng: np.random.Generator,
-    *more: Way, patience: int, most: int,
+    *more: Way, patience: int = PATIENCE,
 ) -> list[End]:  # fmt: skip
     """Descend from children of the best ends until `patience` in a row are no better.
-
-    Once one was better, this takes `most` in a row.
 
     `functions` are the residual and its derivative; `WAYS`, for springs in series `IN_SERIES`
     too, and `more` of them say how a child is made of two ends. Return all ends.
@@ -70,7 +67,7 @@ def hop(
                 break
         out.append((end.cost, end.point))
         if end.cost < (1.0 - ALIKE) * best:
-            failed, patience = 0, most
+            failed = 0
         pool = [group[0] for group in grouped([*pool, out[-1]], DIFFERENT)][:POOL]
     return out
 

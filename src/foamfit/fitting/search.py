@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
-from foamfit.fitting.hops import ALIKE, LONG, ON_LOOP, SHORT, Functions, Way, grouped, hop
+from foamfit.fitting.hops import ALIKE, Functions, Way, grouped, hop
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.starts import BOX_STARTS, Reading, box_starts, thinned
 from foamfit.springs.model import exchanges, neighbours
@@ -35,7 +35,10 @@ ATTEMPTS = 3
 FOUND_AGAIN = 0.02  # relative difference of the costs of descents that agree on the best end
 NOISY = 0.005  # noise of a motion, as a fraction of its range, above which it is smoothed
 MISSING = 0.8  # fraction of the noise floor up to which a cost is mere noise
-MINIMA = 24  # the most minima that are kept
+# Hops in a row on the curves that find nothing better, which ends them: of one spring, and where
+# there are many minima: of springs in series, or if the cost exceeds LOST noise floors (one in an
+# impact, as no law follows the waves in the specimen). MINIMA: the most minima that are kept.
+SHORT, LONG, LOST, MINIMA = 40, 160, 30.0, 24
 # Samples to each side from which the local slope of a loop is taken, and its limits over the mean.
 NEARBY, LEAST_SLOPE, LARGEST_SLOPE = 3, 0.02, 20.0
 # Stages of successive halving: iterations, the share of the starts that then goes on, and that of
@@ -98,10 +101,10 @@ class SearchRecord:
         return _agreeing(self.costs)
 
 
-def _agreeing(ends: Sequence[tuple[float, int]], alike: float = FOUND_AGAIN) -> int:
-    """Return the number of descents that led to the best cost, within a relative difference."""
+def _agreeing(ends: Sequence[tuple[float, int]]) -> int:
+    """Return the number of descents that led to the best cost, within 2 %."""
     best = min(ends, default=(math.inf, 0))[0]  # none if the fit was stopped early
-    return sum(count for cost, count in ends if cost <= (1.0 + alike) * best)
+    return sum(count for cost, count in ends if cost <= (1.0 + FOUND_AGAIN) * best)
 
 
 @dataclass(eq=False)
@@ -270,9 +273,11 @@ def search(
         if attempt + 1 == attempts or _settled(tracker, out, attempt, before, now):
             break
         points = box_starts(space, rng, BOX_STARTS)
-    if not (known and space.model.has_several):  # springs of the poorer model were combined
-        sure = bool(known) or (_agreeing(out, ALIKE) > 1 and not space.model.has_several)
-        out += leave_minimum(tracker, space, rng, SHORT if sure else LONG)
+    several, objective = space.model.has_several, tracker.objective
+    least = objective.floor * (LOST if objective.measurement.striker is None else 1.0)
+    many = several or tracker.best_cost > least
+    if not (several and known):  # springs of the poorer model were combined
+        out += leave_minimum(tracker, space, rng, LONG if many else SHORT)
     return sorted(out)
 
 
@@ -293,7 +298,7 @@ def leave_minimum(
     alike = exchanges if space.model.has_several else partial(neighbours, top=space.scales.stress)
     chains = alike(space.model, tracker.best_values)
     ends += halve(functions, space.box, [space.encode(values) for values in chains])
-    every = hop(space, ends, functions, rng, patience=patience, most=LONG)
+    every = hop(space, ends, functions, rng, patience=patience)
     tracker.ends = [space.decode(group[0][1]) for group in grouped(every, ALIKE)[:MINIMA]]
     return [(cost, 1) for cost, _ in every[len(ends) :]]
 
@@ -354,8 +359,7 @@ def _search_loop(
 
         ends = halve(squares(inner, own), own.box, spread_out(own, points, starts), step)
         if own.model.has_several and not own.model.relaxation:
-            way, few = under_stress(inner, own), {"patience": ON_LOOP, "most": ON_LOOP}
-            ends = hop(own, ends, squares(inner, own), rng, way, **few)
+            ends = hop(own, ends, squares(inner, own), rng, under_stress(inner, own))
         ends = [(cost, space.encode(own.decode(end))) for cost, end in ends]
     finally:
         if inner.best_values is not None:
