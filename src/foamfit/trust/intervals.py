@@ -17,7 +17,7 @@ from types import MappingProxyType
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.errors import InputError
+from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.search import STOPPING, Tracker, what_stopped
 from foamfit.results import Intervals, Profile
 from foamfit.springs.parameters import NUISANCE
@@ -44,7 +44,8 @@ ITERATIONS = 10
 # scales of the parameters.
 FARTHEST = 0.1
 Announce = Callable[[str], None]
-Minima = Sequence[tuple[Array, Array]]  # points at which descents ended, and their residuals
+# Points at which descents ended, their residuals and `_halves`.
+Minima = Sequence[tuple[Array, Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -93,10 +94,14 @@ def assess(
         announce(say("interval", "cost", by=method, count=count, seconds=_seconds(best, count)))
     if method == "mcmc":
         return _by_mcmc(best, choice, tracker)
-    others = [(point, tracker.consider(point)) for point in minima]
+    others = [(x, residual := tracker.consider(x), _halves(best, x, residual)) for x in minima]
     if method == "profile":
         return _with_minima(best, _by_profiles(best, dict.fromkeys(known, SIDES), tracker), others)
     far = departures(best)
+    for point, residual, _ in others:  # a minimum within the cut but outside the local interval
+        apart = np.abs(point - best.values)[best.places] / best.spread.stderr
+        near = (best.rises(residual) < best.quantiles**2) & (apart > best.quantiles)
+        far |= {name: math.inf for name, found in zip(best.names, near, strict=True) if found}
     bent = sorted((name for name in known if far[name] > BENT), key=lambda name: -far[name])
     # Where the range is wider, model error outweighs noise, and a local interval is enough.
     local = [n for n in bent if n in ranges and np.ptp(ranges[n]) > np.ptp(best.local(n))]
@@ -127,8 +132,7 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
     """
     ends, methods = dict(made.ends), dict(made.methods)
     intervals = {name: made.ends.get(name, best.local(name)) for name in best.known}
-    for point, residual in minima:
-        halves = _halves(best, residual)
+    for point, _, halves in minima:
         for name, (low, high) in intervals.items():
             if math.isfinite(half := float(halves[best.names.index(name)])):
                 value = float(point[best.index[name]])
@@ -137,7 +141,7 @@ def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
                     intervals[name] = ends[name] = wider
                     methods[name] = "other minima"
     made, elsewhere = replace(made, ends=ends, methods=methods), dict[str, float]()
-    for point, residual in () if best.misfits else minima:
+    for point, residual, _ in () if best.misfits else minima:
         elsewhere = _far_values(best, made, point, residual) | elsewhere
     return replace(made, elsewhere=elsewhere)
 
@@ -183,10 +187,10 @@ def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
     return replace(made, elsewhere=elsewhere, warnings=warnings)
 
 
-def _halves(best: BestPoint, residual: Array) -> Array:
+def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
     """Return half widths at another minimum, (k,); NaN if noise cannot make it the best.
 
-    The cost is assumed to be the same parabola about that minimum. With model error the minima are
+    The cost is assumed to be a parabola about that minimum too. With model error the minima are
     compared by the effect of noise e on the difference of their costs, 2 eᵀd, with d the difference
     of their residuals.
     """
@@ -197,8 +201,16 @@ def _halves(best: BestPoint, residual: Array) -> Array:
         spread += sum(float(own @ error.noise.times(own)) for error, own in pairs)
         near = float(residual @ residual) - best.cost <= 1.96 * 2.0 * math.sqrt(spread)
         return best.halves if near else np.full(best.halves.shape, np.nan)
+    left = 1.0 - best.rises(residual) / best.quantiles**2
+    if not np.any(left > 0.0):
+        return np.full(left.shape, np.nan)
+    other = BestPoint(best.problem, point, best.names)
+    try:
+        halves = other.halves
+    except SimulationError:  # the stress along the measured motion need not exist there
+        return np.full(left.shape, np.nan)
     with np.errstate(invalid="ignore"):
-        return best.halves * np.sqrt(1.0 - best.rises(residual) / best.quantiles**2)
+        return np.where(left > 0.0, halves * np.sqrt(left), np.nan)
 
 
 def _by_profiles(
