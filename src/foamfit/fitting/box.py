@@ -8,12 +8,13 @@ nuisance parameter runs between its limits.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
@@ -171,18 +172,13 @@ class Coordinate(NamedTuple):
     of: tuple[int, ...] = ()
     is_logarithmic: bool = False
 
-    def ends_at(self, values: list[float]) -> tuple[float, float]:
+    def ends_at(self, values: Array | list[float]) -> tuple[float, float]:
         """Return the values of the parameter at the coordinates 0 and 1 (if not logarithmic)."""
         if isinstance(self.ends, Between):
-            return self.ends.ends(*[values[place] for place in self.of])
+            return self.ends.ends(*[float(values[place]) for place in self.of])
         return self.ends
 
-    def slopes_at(self, values: list[float]) -> Sequence[tuple[float, float]]:
-        """Return the derivatives of both ends by each of the parameters `of`."""
-        given = [values[place] for place in self.of]
-        return self.ends.slopes(*given) if isinstance(self.ends, Between) else ()
-
-    def value(self, u: float, values: list[float]) -> float:
+    def value(self, u: float, values: Array | list[float]) -> float:
         """Return the parameter at coordinate `u`, ignoring its limits.
 
         `values` must contain the parameters that its ends depend on.
@@ -246,13 +242,37 @@ class Space:
         low, high = np.reshape(limits, (-1, 2)).T.copy()
         return low, high
 
+    @cached_property
+    def _plain(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_], Array, Array]:
+        """Coordinates whose ends are fixed: their numbers, places, and ways of transformation.
+
+        The value is first + step exp(u) if the coordinate is logarithmic, else first + step u.
+        """
+        plain = [(j, one) for j, one in enumerate(self.coordinates) if not one.of]
+        ends = np.reshape([one.ends_at([]) for _, one in plain], (-1, 2))
+        logs = np.array([one.is_logarithmic for _, one in plain], bool)
+        first = np.where(logs, 0.0, ends[:, 0])
+        numbers, places = [j for j, _ in plain], [one.place for _, one in plain]
+        return np.array(numbers, int), np.array(places, int), logs, first, ends[:, 1] - first
+
+    @cached_property
+    def _bounds(self) -> Array:
+        """Least and largest values of the parameters of `_plain`, (2, n), SI."""
+        return np.stack((self.low, self.high))[:, self._plain[1]]
+
+    @cached_property
+    def _dependent(self) -> list[tuple[int, Coordinate, Between]]:
+        """Numbers of coordinates whose ends depend on other parameters, these, and the ends."""
+        every = enumerate(self.coordinates)
+        return [(j, one, one.ends) for j, one in every if one.of and isinstance(one.ends, Between)]
+
     def encode(self, values: Array) -> Array:
         """Return the coordinates of a vector of parameters, moved into the box."""
-        out, own = np.empty(len(self.coordinates)), values.tolist()
+        out = np.empty(len(self.coordinates))
         for j, one in enumerate(self.coordinates):
-            first, last = one.ends_at(own)
+            first, last = one.ends_at(values)
             if one.is_logarithmic:
-                out[j] = math.log(max(own[one.place], 1e-300) / last)
+                out[j] = np.log(max(values[one.place], 1e-300) / last)
             else:
                 out[j] = (values[one.place] - first) / (last - first)
         low, high = self.box
@@ -261,11 +281,16 @@ class Space:
 
     def decode(self, point: Array) -> Array:
         """Return the vector of parameters (SI) at a point of the box."""
-        values = self.values.tolist()
-        for one, u in zip(self.coordinates, point.tolist(), strict=True):
-            least, most = one.bounds
-            values[one.place] = min(max(one.value(u, values), least), most)
-        return self.complete(np.array(values))
+        values, (plain, places, logs, first, step) = self.values.copy(), self._plain
+        u = point[plain]
+        np.exp(u, out=u, where=logs)
+        low, high = self._bounds
+        values[places] = np.minimum(np.maximum(first + step * u, low), high)
+        own = values.tolist()
+        for j, one, ends in self._dependent:
+            (begin, end), (least, most) = ends.ends(*[own[place] for place in one.of]), one.bounds
+            own[one.place] = min(max(begin + point.item(j) * (end - begin), least), most)
+        return self.complete(np.array(own))
 
     def complete(self, values: Array) -> Array:
         """Set the parameters of a vector that depend on others through expressions."""
@@ -277,14 +302,18 @@ class Space:
         `values` is the decoded `point`.
         """
         moves, own = np.zeros((values.size, point.size)), values.tolist()
-        for j, (one, u) in enumerate(zip(self.coordinates, point.tolist(), strict=True)):
-            (first, last), (least, most), at = one.ends_at(own), one.bounds, one.place
-            if one.is_logarithmic:
-                moves[at, j] = own[at]
-            elif least <= first + u * (last - first) <= most:
-                moves[at, j] = last - first
-                for place, by in zip(one.of, one.slopes_at(own), strict=True):
-                    moves[at] += (by[0] + u * (by[1] - by[0])) * moves[place]
+        plain, places, logs, first, step = self._plain
+        low, high = self._bounds
+        u = first + step * point[plain]
+        moves[places, plain] = np.where(logs, values[places], step * ((low <= u) & (u <= high)))
+        for j, one, ends in self._dependent:
+            at, part, given = one.place, point.item(j), [own[place] for place in one.of]
+            (begin, end), (least, most) = ends.ends(*given), one.bounds
+            for place, (first_by, last_by) in zip(one.of, ends.slopes(*given), strict=True):
+                moves[at] += (first_by + part * (last_by - first_by)) * moves[place]
+            moves[at, j] = end - begin
+            if not least <= begin + part * (end - begin) <= most:
+                moves[at] = 0.0
         if self.tied is None:
             return moves
         return follow(self.tied, values, moves, np.full(point.size, 1e-5))
