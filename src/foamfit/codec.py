@@ -21,7 +21,7 @@ from foamfit.errors import InputError
 from foamfit.springs.spring import Spring
 
 Columns = Mapping[str, Array]
-_hints = cache(get_type_hints)
+_hints = cache(get_type_hints)  # which takes most of the time of `build`
 _PARAMETER = ("value", "vary", "min", "max", "stderr", "expr")
 _NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
@@ -111,7 +111,7 @@ def build(made: Any, content: Mapping[str, Any], columns: Columns, **names: Any)
     `names` are the names in its annotations that its module imports for typing only. Raises
     KeyError, TypeError, ValueError or AttributeError if a field is missing or invalid.
     """
-    hints = get_type_hints(made, localns=names) if names else _hints(made)  # slow: kept
+    hints = get_type_hints(made, localns=names) if names else _hints(made)
     given = {}
     for one in fields(made):
         missing = one.default is MISSING and one.default_factory is MISSING

@@ -254,6 +254,7 @@ def card(
     format: str,
     units: str = "kg-mm-ms",
     rates: float | Iterable[float | str] | None = None,
+    out: str | Path | None = None,
 ) -> Card:
     r"""Make a material card (`Card`) of a fitted law.
 
@@ -268,12 +269,14 @@ def card(
         "kg-mm-ms", "t-mm-s" or "SI".
     rates : float or iterable of float, optional
         Strain rates of the loading curves, 1/s; by default those of the fitted tests.
+    out : str or Path, optional
+        File to write; FILE.json, FILE.png and FILE.pdf are written next to it.
 
     Raises
     ------
     InputError
-        If the result cannot be read or has no hysteretic spring, format or units are unknown, or a
-        rate is not positive.
+        If the result cannot be read or has no hysteretic spring, format or units are unknown, a
+        rate is not positive, or `out` cannot be written.
     SimulationError
         If the law cannot be simulated along a curve or a record.
     """
@@ -309,7 +312,7 @@ def card(
         guessed=loading.guessed(source, curves),
         density=bool(densities),
     )
-    return Card(
+    made = Card(
         name=source.name,
         format=format,
         units=units,
@@ -324,6 +327,9 @@ def card(
         warnings=warnings,
         records=tuple(records),
     )
+    if out is not None:
+        made.save(out)
+    return made
 
 
 def check(format: str, units: str, rates: float | Iterable[float | str] | None) -> list[float]:

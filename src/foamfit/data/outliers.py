@@ -325,7 +325,12 @@ def find_standstills(record: Record) -> list[tuple[int, int]]:
 
 def _jumps(w: Array, noise: float, step: int, width: int) -> dict[int, int]:
     """Return the first samples after jumps from a standstill, and the length of each jump."""
-    n, ranges = len(w), np.ptp(sliding_window_view(w, width), axis=1)
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    n = len(w)
+    # The window of sample i ends at sample i.
+    shift: Any = {"size": width, "origin": (width - 1) // 2, "mode": "nearest"}
+    range_before = maximum_filter1d(w, **shift) - minimum_filter1d(w, **shift)
     least = max(_LEAP * float(np.ptp(w)), _ABOVE_NOISE * noise, _DIGITS * quantum(w))
     found = dict[int, int]()
     for length in range(_LONGEST, 0, -1):  # shorter jumps replace longer ones
@@ -334,7 +339,7 @@ def _jumps(w: Array, noise: float, step: int, width: int) -> dict[int, int]:
         far = np.abs(jump)
         later = np.minimum(last + length + 2 * max(step, length), n - 1)
         goes_on = (w[later] - w[last + length]) * np.sign(jump) > _GOES_ON * far
-        stands = ranges[last - width + 1] <= _STANDS * far + _SCATTER * noise
+        stands = range_before[last] <= _STANDS * far + _SCATTER * noise
         good = (far >= least) & stands & ~goes_on
         found |= dict.fromkeys((last[good] + length).tolist(), length)
     return found

@@ -113,7 +113,7 @@ def condition(
     if is_velocity(whole) and (impact or "stress" in whole.derived):  # else it shows its noise
         velocity = whole.curves("velocity")["velocity"]
         noise["displacement"] = noise_of_integral(whole.instants, velocity)
-    # Without time, from the first row kept
+    # The rows of a record without time are counted from the first one kept.
     zero = 0.0 if used.place else whole.origins.get("contact_time", float(span.first))
     test = _measured(
         whole, record, block, excess, specimen=specimen, striker=striker and given, flight=flight,

@@ -25,6 +25,7 @@ from foamfit.fitting.problem import Problem, fix_and_vary, make_params
 from foamfit.fitting.search import Tracker, descend
 from foamfit.fitting.together import Together, fit_linked
 from foamfit.one_model import Options, Progress, identify
+from foamfit.report.folder import check_target
 from foamfit.springs.model import Model
 from foamfit.study.joint_fit import Vectors, fit_jointly
 from foamfit.study.joint_result import Alternative, JointResult, result_of
@@ -66,7 +67,9 @@ class _Test:
 def joint(
     path: str | Path | Study,
     *,
+    out: str | Path | None = None,
     seed: int | None = None,
+    report: bool = True,
     progress: Progress | None = None,
 ) -> JointResult:
     """Fit the tests of a study together; returns a `JointResult`.
@@ -76,6 +79,8 @@ def joint(
     path : str, Path or Study
         STUDY.toml, or the result of `read_study`: tests, model, drive, and for each parameter its
         kind ("shared", "own", "scatter", "log rate", "power rate" or "auto") or a fixed value.
+    out : str or Path, optional
+        Folder for the result, written as by `JointResult.save` with or without `report`.
     seed : int, optional
         Seed of the search; by default the seed of the study, or 0.
     progress : callable, optional
@@ -92,6 +97,8 @@ def joint(
     began, tell = time.perf_counter(), progress or (lambda *_: None)
     study = path if isinstance(path, Study) else read_study(path)
     study = study if seed is None else replace(study, seed=seed)
+    if out is not None:
+        check_target(out, of="joint.json")
     options = Options(
         drive=study.drive, seed=study.seed, starts=study.starts, relaxation=study.relaxation
     )
@@ -116,6 +123,8 @@ def joint(
     about = {"evidence": tried, "refused": refused, "runtime_s": took, "rate0": _median_rate(rates)}
     result = result_of(study, files, rates, fit, alone, slopes, **about)
     tell(1.0, "done")
+    if out is not None:
+        result.save(out, report=report)
     return result
 
 

@@ -35,7 +35,7 @@ _STATISTICS = re.compile(
     "mean|average|avg|mittelwert|median|st(andar)?d(d?ev(iation)?)?|sd|standardabweichung|stabw|cv|"
     "sem|var(iance|ianz)?|min(imum)?|max(imum)?|range|count|n|sum|summe|25%|50%|75%"
 )
-_STATISTICS_ROWS = 12  # most of these
+_STATISTICS_ROWS, _FOOT = 12, 24  # most of these, and rows among which they are sought
 # What programs write for a missing number
 _MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "none"}
 # A time of day such as 12:00:00.5 or 3:00:00.5 PM, with or without a date before it.
@@ -432,12 +432,13 @@ def without_foot(table: Table) -> Table:
     rows above, or its last number ends in the decimal sign, or has fewer decimals while the
     `_ABOVE` rows above all have the same number.
     """
-    rows, foot = table.content.rstrip().split("\n"), list[int]()
-    while len(rows) > table.first_row and _is_statistic(table, rows[-1]):
-        foot += [len(rows)] * bool(rows.pop().strip())
+    rest, *rows = table.content.rstrip().rsplit("\n", _FOOT)
+    over, foot = rest.count("\n") + 1, list[int]()  # rows over these
+    while rows and over + len(rows) > table.first_row and _is_statistic(table, rows[-1]):
+        foot += [over + len(rows)] * bool(rows.pop().strip())
     if 0 < len(foot) <= _STATISTICS_ROWS:  # more are a column of words
         dropped = Dropped.of(np.array(foot[::-1]), "statistics below the table")
-        return replace(table, content="\n".join(rows), dropped=(dropped,))
+        return replace(table, content="\n".join([rest, *rows]), dropped=(dropped,))
     above = table.body().rsplit("\n", _ABOVE)[1:]
     if len(above) < MIN_ROWS or not above[-1].strip() or '"' in above[-1]:
         return table
