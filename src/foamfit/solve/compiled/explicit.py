@@ -12,12 +12,23 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
 from scipy.integrate._ivp import dop853_coefficients as pair
 
 from foamfit.solve.compiled import events
 from foamfit.solve.compiled.motion import rates
 from foamfit.solve.compiled.run import STEPPED, call_short, stepping
-from foamfit.springs.compiled.contract import inner, past
+from foamfit.springs.compiled.contract import (
+    REAL,
+    REALS_AT,
+    WHOLE,
+    WHOLES_AT,
+    emitted,
+    inner,
+    past,
+    start,
+)
 
 ALL_STAGES = 16  # those of a step and of the dense output
 _A = np.zeros((ALL_STAGES, ALL_STAGES))
@@ -42,17 +53,52 @@ LAST_TERM = 3e-4  # share of the last term of the dense output that counts as it
 AIMED = 0.77  # growth of a step whose dense output has an error of 1; few steps are then repeated
 
 
+def _emit_sum(context, builder, signature, args):
+    """Add up four components at a time, in two sums that do not wait for each other."""
+    n, wide, first, last, scale, weights, origins, stage, begin, out = args
+    four = ir.VectorType(ir.DoubleType(), 4)
+    none, step, pair_of = (context.get_constant(types.intp, k) for k in (0, 4, 2))
+
+    def quad(pointer, *offsets):
+        for offset in offsets:
+            pointer = builder.gep(pointer, [offset])
+        return builder.bitcast(pointer, four.as_pointer())
+
+    def load(pointer):
+        return builder.load(pointer, align=8)
+
+    def spread(number):
+        lane = builder.insert_element(ir.Constant(four, ir.Undefined), number, ir.IntType(32)(0))
+        return builder.shuffle_vector(lane, lane, ir.Constant(ir.VectorType(ir.IntType(32), 4), [0] * 4))
+
+    def add(total, factor, vector):
+        return builder.fadd(total, builder.fmul(factor, vector, ("contract",)), ("contract",))
+
+    factor = spread(scale)
+    with cgutils.for_range_slice(builder, none, n, step) as (i, _):
+        sums = [cgutils.alloca_once_value(builder, ir.Constant(four, [0.0] * 4)) for _ in range(2)]
+        with cgutils.for_range_slice(builder, first, last, pair_of) as (k, _):
+            for m, total in enumerate(sums):
+                at = builder.add(k, context.get_constant(types.intp, m))
+                row = builder.mul(builder.load(builder.gep(origins, [at])), wide)
+                weight = spread(builder.load(builder.gep(weights, [at])))
+                builder.store(add(builder.load(total), weight, load(quad(stage, row, i))), total)
+        whole = builder.fadd(*map(builder.load, sums), ("contract",))
+        builder.store(add(load(quad(begin, i)), factor, whole), quad(out, i), align=8)
+    return context.get_dummy_value()
+
+
+_sum = emitted(
+    types.void(*[WHOLE] * 4, REAL, REALS_AT, WHOLES_AT, REALS_AT, REALS_AT, REALS_AT), _emit_sum
+)
+
+
 @inner
 def combine(c, n, row, scale, begin, out):
     """Fill out = begin + scale Σ WEIGHT[k] stage[FROM[k]] of a row of coefficients."""
-    stage, wide, source = c.stage, c.wide, begin
-    for k in range(FIRST[row], FIRST[row + 1], 4):  # loops that are vectorised
-        one, two, three, four = WEIGHT[k], WEIGHT[k + 1], WEIGHT[k + 2], WEIGHT[k + 3]
-        a, b = past(stage, FROM[k] * wide), past(stage, FROM[k + 1] * wide)
-        d, e = past(stage, FROM[k + 2] * wide), past(stage, FROM[k + 3] * wide)
-        for i in range(n):
-            out[i] = source[i] + scale * (one * a[i] + two * b[i] + (three * d[i] + four * e[i]))
-        source = out
+    _sum(
+        n, c.wide, FIRST[row], FIRST[row + 1], scale, start(WEIGHT), start(FROM), c.stage, begin, out
+    )
 
 
 @inner
