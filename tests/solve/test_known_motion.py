@@ -105,7 +105,7 @@ def test_a_top_that_is_not_where_it_was_prescribed_is_refused(monkeypatch) -> No
 
     def drifted(self: Plan, *given, **more):
         motion = run(self, *given, **more)
-        return motion._replace(displacement=motion.displacement * (1.0 + 1e-5))
+        return replace(motion, displacement=motion.displacement * (1.0 + 1e-5))
 
     monkeypatch.setattr(Plan, "run", drifted)
     with pytest.raises(SimulationError, match="miss the prescribed displacement by 1e-05 of its"):

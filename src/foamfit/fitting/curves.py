@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from numbers import Real
 
 import numpy as np
@@ -275,7 +276,7 @@ def without_tension(motion: Motion) -> Motion:
     slopes = motion.slopes
     if slopes is not None:
         slopes = slopes._replace(base_stress=np.where(lost, 0.0, slopes.base_stress))
-    return motion._replace(base_stress=np.where(lost, 0.0, motion.base_stress), slopes=slopes)
+    return replace(motion, base_stress=np.where(lost, 0.0, motion.base_stress), slopes=slopes)
 
 
 def later(time: Array, curves: Array, late: float) -> Array:

@@ -7,7 +7,7 @@ parameters of springs and channels to the curves, each stacked on its derivative
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -168,7 +168,7 @@ class Scenes:
         """Return the scenes with a changed driving motion."""
         other = copy(self)
         pairs = self.plans.items()
-        other.plans = {key: plan._replace(values=plan.values + change) for key, plan in pairs}
+        other.plans = {key: replace(plan, values=plan.values + change) for key, plan in pairs}
         return other
 
     def _loading(self) -> Drive:
@@ -300,7 +300,7 @@ class Scenes:
             motion = without_tension(motion)
         shown = motion
         if late != 0.0 and self.drive == "impact":
-            shown = run(plan._replace(time=plan.time - late), inside)
+            shown = run(replace(plan, time=plan.time - late), inside)
         along = motion if self.driven else None
         if along is None and (everything or "stress_strain" in counted) and self._along:
             along = without_tension(run(self._followed(self._along[damped], at), False))
@@ -341,21 +341,21 @@ class Scenes:
             moved = plan.values - zero  # below zero there is no contact
             touched = int(np.argmax(moved > 0.0)) if self.glued else moved.size
             np.maximum(moved[:touched], 0.0, out=moved[:touched])
-            return plan._replace(values=moved)
+            return replace(plan, values=moved)
         if self.drive != "impact":
             return plan
         mass = plan.mass.copy()
         mass[-1] = at[nuisances.STRIKER_MASS] / self.measurement.specimen.area
         time, weight = self.clock - at[nuisances.CONTACT_TIME], plan.values * mass[-1:]
-        return plan._replace(
-            time=time, speed=at[nuisances.VELOCITY], mass=mass, values=weight / plan.mass[-1]
+        return replace(
+            plan, time=time, speed=at[nuisances.VELOCITY], mass=mass, values=weight / plan.mass[-1]
         )
 
     def _followed(self, plan: Plan, at: dict[str, float]) -> Plan:
         """Return the plan along the measured motion, zero without contact."""
         values = np.maximum(plan.values - at.get("displacement_zero", 0.0), 0.0)
         before = self.clock < at.get(nuisances.CONTACT_TIME, -np.inf)
-        return plan._replace(values=np.where(before, 0.0, values))
+        return replace(plan, values=np.where(before, 0.0, values))
 
     def _sampled(self, values: Array) -> Array:
         """Return the mean over the instants that each sample averages, along the last axis."""
@@ -369,15 +369,15 @@ class Scenes:
         """Return a simulated motion at the times of the samples."""
         if not self._plain:
             moved, stress = self._sampled(motion.displacement), self._sampled(motion.base_stress)
-            motion = motion._replace(displacement=moved, base_stress=stress)
+            motion = replace(motion, displacement=moved, base_stress=stress)
         if self._earlier:
             of_cycle = motion.switches[:, 0] > self.clock[self._earlier - 1]
-            motion = motion._replace(switches=motion.switches[of_cycle])
+            motion = replace(motion, switches=motion.switches[of_cycle])
         if contact == 0.0:
             return motion
         switches = motion.switches.copy()
         switches[:, 0] += contact
-        return motion._replace(switches=switches, contact_end=motion.contact_end + contact)
+        return replace(motion, switches=switches, contact_end=motion.contact_end + contact)
 
     def _late(self, name: str, rows: Array, late: float, column: int | None) -> Array:
         """Return curves on the clock of the file, whose motion is `late` seconds late.

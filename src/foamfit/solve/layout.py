@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
 from itertools import pairwise
@@ -21,7 +22,8 @@ from foamfit.springs.laws.record import OWN_ETA, Law
 Memory = tuple[NDArray[np.int64], Array]  # the integers and floats of a run
 
 
-class Layout(NamedTuple):
+@dataclass(frozen=True, eq=False, slots=True)
+class Layout:
     """Where everything of a run lies."""
 
     words: NDArray[np.int64]  #: integers of a run, with places instead of addresses

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -40,7 +41,8 @@ class Slopes(NamedTuple):
     base_stress: Array  #: (p, n_t)
 
 
-class Motion(NamedTuple):
+@dataclass(eq=False, slots=True)  # as for `plan.Plan`
+class Motion:
     """Result of a run before verification; for the fields see `Response`."""
 
     displacement: Array

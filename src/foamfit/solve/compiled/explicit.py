@@ -19,16 +19,8 @@ from scipy.integrate._ivp import dop853_coefficients as pair
 from foamfit.solve.compiled import events
 from foamfit.solve.compiled.motion import rates
 from foamfit.solve.compiled.run import STEPPED, call_short, stepping
-from foamfit.springs.compiled.contract import (
-    REAL,
-    REALS_AT,
-    WHOLE,
-    WHOLES_AT,
-    emitted,
-    inner,
-    past,
-    start,
-)
+from foamfit.springs.compiled import contract
+from foamfit.springs.compiled.contract import inner, past, start
 
 ALL_STAGES = 16  # those of a step and of the dense output
 _A = np.zeros((ALL_STAGES, ALL_STAGES))
@@ -40,7 +32,7 @@ _A[STEPPED, :STEPPED] = pair.B
 _FULL = np.zeros((22, ALL_STAGES))
 _FULL[:16], _FULL[16:20], _FULL[20, :13], _FULL[21, :13] = _A, pair.D, pair.E5, pair.E3
 _ROWS = [np.flatnonzero(row) for row in _FULL]
-_WIDE = [(0, -row.size % 4) for row in _ROWS]  # zeros that fill up a row to a multiple of 4
+_WIDE = [(0, row.size % 2) for row in _ROWS]  # a zero that fills up a row to pairs
 FIRST = np.cumsum([0, *(row.size + wide[1] for row, wide in zip(_ROWS, _WIDE, strict=True))])
 FROM = np.concatenate([np.pad(row, wide) for row, wide in zip(_ROWS, _WIDE, strict=True)])
 WEIGHT = np.concatenate(
@@ -55,50 +47,51 @@ AIMED = 0.77  # growth of a step whose dense output has an error of 1; few steps
 
 def _emit_sum(context, builder, signature, args):
     """Add up four components at a time, in two sums that do not wait for each other."""
-    n, wide, first, last, scale, weights, origins, stage, begin, out = args
-    four = ir.VectorType(ir.DoubleType(), 4)
-    none, step, pair_of = (context.get_constant(types.intp, k) for k in (0, 4, 2))
+    n, wide, first, last, scale, weights, sources, stage, begin, out = args
+    four, together = ir.VectorType(ir.DoubleType(), 4), ("contract",)
+    zero, one, two, quad = (context.get_constant(types.intp, k) for k in (0, 1, 2, 4))
 
-    def quad(pointer, *offsets):
-        for offset in offsets:
-            pointer = builder.gep(pointer, [offset])
-        return builder.bitcast(pointer, four.as_pointer())
+    def at(pointer, place):
+        return builder.bitcast(builder.gep(pointer, [place]), four.as_pointer())
 
-    def load(pointer):
-        return builder.load(pointer, align=8)
+    def read(pointer, place):
+        return builder.load(at(pointer, place), align=8)
 
     def spread(number):
         lane = builder.insert_element(ir.Constant(four, ir.Undefined), number, ir.IntType(32)(0))
-        return builder.shuffle_vector(lane, lane, ir.Constant(ir.VectorType(ir.IntType(32), 4), [0] * 4))
+        return builder.shuffle_vector(lane, lane, ir.VectorType(ir.IntType(32), 4)([0] * 4))
 
-    def add(total, factor, vector):
-        return builder.fadd(total, builder.fmul(factor, vector, ("contract",)), ("contract",))
+    def add(total, factor, values):
+        return builder.fadd(total, builder.fmul(factor, values, together), together)
 
-    factor = spread(scale)
-    with cgutils.for_range_slice(builder, none, n, step) as (i, _):
-        sums = [cgutils.alloca_once_value(builder, ir.Constant(four, [0.0] * 4)) for _ in range(2)]
-        with cgutils.for_range_slice(builder, first, last, pair_of) as (k, _):
-            for m, total in enumerate(sums):
-                at = builder.add(k, context.get_constant(types.intp, m))
-                row = builder.mul(builder.load(builder.gep(origins, [at])), wide)
-                weight = spread(builder.load(builder.gep(weights, [at])))
-                builder.store(add(builder.load(total), weight, load(quad(stage, row, i))), total)
-        whole = builder.fadd(*map(builder.load, sums), ("contract",))
-        builder.store(add(load(quad(begin, i)), factor, whole), quad(out, i), align=8)
+    with cgutils.for_range_slice(builder, zero, n, quad) as (i, _):
+        sums = [cgutils.alloca_once_value(builder, four([0.0] * 4)) for _ in range(2)]
+        with cgutils.for_range_slice(builder, first, last, two) as (k, _):
+            for place, total in zip((k, builder.add(k, one)), sums, strict=True):
+                row = builder.mul(builder.load(builder.gep(sources, [place])), wide)
+                weight = spread(builder.load(builder.gep(weights, [place])))
+                values = read(stage, builder.add(row, i))
+                builder.store(add(builder.load(total), weight, values), total)
+        change = builder.fadd(*map(builder.load, sums), together)
+        builder.store(add(read(begin, i), spread(scale), change), at(out, i), align=8)
     return context.get_dummy_value()
 
 
-_sum = emitted(
-    types.void(*[WHOLE] * 4, REAL, REALS_AT, WHOLES_AT, REALS_AT, REALS_AT, REALS_AT), _emit_sum
+_at = contract.REALS_AT
+_sum = contract.emitted(
+    types.void(*[contract.WHOLE] * 4, contract.REAL, _at, contract.WHOLES_AT, _at, _at, _at),
+    _emit_sum,
 )
 
 
 @inner
 def combine(c, n, row, scale, begin, out):
-    """Fill out = begin + scale Σ WEIGHT[k] stage[FROM[k]] of a row of coefficients."""
-    _sum(
-        n, c.wide, FIRST[row], FIRST[row + 1], scale, start(WEIGHT), start(FROM), c.stage, begin, out
-    )
+    """Fill out = begin + scale Σ WEIGHT[k] stage[FROM[k]] of a row of coefficients.
+
+    All are filled up to a multiple of four components.
+    """
+    k, last = FIRST[row], FIRST[row + 1]
+    _sum(n, c.wide, k, last, scale, start(WEIGHT), start(FROM), c.stage, begin, out)
 
 
 @inner

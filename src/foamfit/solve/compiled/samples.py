@@ -12,7 +12,7 @@ from foamfit.solve.compiled.motion import dense, rates_of
 from foamfit.solve.compiled.run import BATCH, numbers, sampling, spring
 from foamfit.solve.scene import FREE, MOTION
 from foamfit.springs.compiled import contract
-from foamfit.springs.compiled.contract import inlined, inner, past
+from foamfit.springs.compiled.contract import inlined, inner, outer, past, start
 from foamfit.springs.laws.record import BEGUN, OWN_ETA, OWN_RELAXATION, STRUCK
 
 # Tasks, instead of the number of a sample: write those up to a time inside the step, those after
@@ -44,6 +44,15 @@ def _rise(c, i, reach):
     for j in range(p):
         reach[j] += height * strain[j] + eps * own[j]
     return height * eps
+
+
+@outer
+def increases(time):
+    """Whether sample times increase."""
+    values, fine = start(time), 1
+    for k in range(1, time.size):
+        fine += values[k] > values[k - 1]
+    return fine == time.size
 
 
 @inner
