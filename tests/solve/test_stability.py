@@ -38,7 +38,7 @@ def ended(point: Point) -> tuple[ff.Response | None, str]:
 def bare(point: Point, rtol: float, implicit: bool | None) -> Motion:
     """Run a scene once, without the check of `simulate` with shorter steps."""
     chain, drive, time = scene_of(point)
-    made = plan(chain, drive, time)._replace(implicit=implicit)
+    made = replace(plan(chain, drive, time), implicit=implicit)
     return made.run(chain.arrays.rows, chain.arrays.heights, rtol)
 
 
