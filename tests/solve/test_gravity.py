@@ -49,7 +49,7 @@ def test_implicit_steps_and_many_springs_know_gravity(eta: float) -> None:
     made = plan(scene(eta), Impact(7e-3, 2.0, WEIGHT), time)
     rows, heights = scene(eta).arrays.rows, np.array([1.19e-3])
     explicit = made.run(rows, heights, 1e-9)
-    implicit = replace(made, implicit=True).run(rows, heights, 1e-8)
+    implicit = made.changed(implicit=True).run(rows, heights, 1e-8)
     assert share(implicit.base_stress, explicit.base_stress) < 1e-7
     assert share(implicit.displacement, explicit.displacement) < 1e-7
     assert implicit.contact_end == pytest.approx(explicit.contact_end, rel=1e-7)
@@ -63,7 +63,7 @@ def test_implicit_steps_and_many_springs_know_gravity(eta: float) -> None:
 def test_derivatives_under_gravity_are_those_of_differences(implicit: bool) -> None:
     time = np.linspace(-2e-4, 3e-3, 300)
     chain = scene(200.0)
-    made = replace(plan(chain, Impact(7e-3, 2.0, WEIGHT), time), implicit=implicit)
+    made = plan(chain, Impact(7e-3, 2.0, WEIGHT), time).changed(implicit=implicit)
     rows, heights = chain.arrays.rows, np.array([1.19e-3])
     directions = np.array([[0, 0], [0, 3]])  # k0 and eps_a
     slopes = made.run(rows, heights, 1e-9, directions=directions).slopes

@@ -38,7 +38,7 @@ def ended(point: Point) -> tuple[ff.Response | None, str]:
 def bare(point: Point, rtol: float, implicit: bool | None) -> Motion:
     """Run a scene once, without the check of `simulate` with shorter steps."""
     chain, drive, time = scene_of(point)
-    made = replace(plan(chain, drive, time), implicit=implicit)
+    made = plan(chain, drive, time).changed(implicit=implicit)
     return made.run(chain.arrays.rows, chain.arrays.heights, rtol)
 
 

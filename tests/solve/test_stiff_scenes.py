@@ -1,6 +1,5 @@
 """The implicit integrator: its order, and its results against other solvers and limits."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -36,7 +35,7 @@ def run(
     chain: ff.Chain, load: Drive, rtol: float, implicit: bool | None = True, time: np.ndarray = TIME
 ) -> Motion:
     """Run a scene with implicit or explicit steps (None: chosen by the package)."""
-    scene = replace(plan(chain, load, time), implicit=implicit)
+    scene = plan(chain, load, time).changed(implicit=implicit)
     return scene.run(chain.arrays.rows, chain.arrays.heights, rtol)
 
 
@@ -201,7 +200,7 @@ def test_the_choice() -> None:
 
 def test_the_bound_on_steps() -> None:
     chain, load = struck("foam-2", 1e-2)
-    few = replace(plan(chain, load, TIME, max_steps=5), implicit=True)
+    few = plan(chain, load, TIME, max_steps=5).changed(implicit=True)
     with pytest.raises(ff.SimulationError, match="bound of 5 steps"):
         few.run(chain.arrays.rows, chain.arrays.heights, 1e-6)
 

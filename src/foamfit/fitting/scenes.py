@@ -168,7 +168,7 @@ class Scenes:
         """Return the scenes with a changed driving motion."""
         other = copy(self)
         pairs = self.plans.items()
-        other.plans = {key: replace(plan, values=plan.values + change) for key, plan in pairs}
+        other.plans = {key: plan.changed(values=plan.values + change) for key, plan in pairs}
         return other
 
     def _loading(self) -> Drive:
@@ -300,7 +300,7 @@ class Scenes:
             motion = without_tension(motion)
         shown = motion
         if late != 0.0 and self.drive == "impact":
-            shown = run(replace(plan, time=plan.time - late), inside)
+            shown = run(plan.changed(time=plan.time - late), inside)
         along = motion if self.driven else None
         if along is None and (everything or "stress_strain" in counted) and self._along:
             along = without_tension(run(self._followed(self._along[damped], at), False))
@@ -341,21 +341,20 @@ class Scenes:
             moved = plan.values - zero  # below zero there is no contact
             touched = int(np.argmax(moved > 0.0)) if self.glued else moved.size
             np.maximum(moved[:touched], 0.0, out=moved[:touched])
-            return replace(plan, values=moved)
+            return plan.changed(values=moved)
         if self.drive != "impact":
             return plan
         mass = plan.mass.copy()
         mass[-1] = at[nuisances.STRIKER_MASS] / self.measurement.specimen.area
         time, weight = self.clock - at[nuisances.CONTACT_TIME], plan.values * mass[-1:]
-        return replace(
-            plan, time=time, speed=at[nuisances.VELOCITY], mass=mass, values=weight / plan.mass[-1]
-        )
+        speed, values = at[nuisances.VELOCITY], weight / plan.mass[-1]
+        return plan.changed(time=time, speed=speed, mass=mass, values=values)
 
     def _followed(self, plan: Plan, at: dict[str, float]) -> Plan:
         """Return the plan along the measured motion, zero without contact."""
         values = np.maximum(plan.values - at.get("displacement_zero", 0.0), 0.0)
         before = self.clock < at.get(nuisances.CONTACT_TIME, -np.inf)
-        return replace(plan, values=np.where(before, 0.0, values))
+        return plan.changed(values=np.where(before, 0.0, values))
 
     def _sampled(self, values: Array) -> Array:
         """Return the mean over the instants that each sample averages, along the last axis."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -136,7 +136,7 @@ def _agrees_with_longer_steps(
     Longer steps cost less than shorter ones.
     """
     part = slice(None, None, THINNED if scene.speed > 0.0 else None)
-    scene = replace(scene, time=scene.time[part].copy())
+    scene = scene.changed(time=scene.time[part].copy())
     rough = scene.run(arrays.rows, arrays.heights, min(LONGER * rtol, LONGEST / scene.margin))
     return _miss(motion.displacement[:, part], motion.base_stress[part], rough) <= 0.3 * rtol
 
@@ -160,7 +160,7 @@ def _compared(
         if rtol * factor < 1e-14:
             break
         try:
-            finer = run(replace(scene, least=plans.LEAST_TOL), rtol * factor)
+            finer = run(scene.changed(least=plans.LEAST_TOL), rtol * factor)
         except SimulationError:
             if scene.implicit is False:  # the last resort, see `_resolve_vibrations`
                 raise SimulationError(_UNRESOLVED.format(size=lost)) from None
@@ -197,14 +197,14 @@ def _resolve_vibrations(
     error = SimulationError(_UNRESOLVED.format(size=motion.unresolved))
     if explicit:
         try:
-            scene = replace(scene, implicit=False)
+            scene = scene.changed(implicit=False)
             return run(scene, rtol), scene
         except SimulationError:
             raise error from None
     for factor in (1e-2, 1e-4):
         if motion.steps < MOST_FOLLOWED and rtol * factor >= 1e-14:
             with suppress(SimulationError):
-                finer = run(replace(scene, implicit=True), rtol * factor)
+                finer = run(scene.changed(implicit=True), rtol * factor)
                 if finer.unresolved <= 0.7 * rtol:
                     return finer, scene
     raise error
