@@ -28,8 +28,9 @@ SAME, TOO_LONG, UNFIT = range(3)  # ends of a step of `decay`; UNFIT if the law 
 def bring_to(c, eps):
     """Bring the spring to a strain on its branch; return the stress."""
     s, n = c.springs, c.numbers
-    call_number(n.settle, past(s, c.row), s, eps)
-    evaluate(c, c.none, int(c.p > 0))
+    known = call_number(n.settle, past(s, c.row), s, eps)
+    if c.p > 0 or known == 0.0:
+        evaluate(c, c.none, int(c.p > 0))
     return s.sigma
 
 

@@ -36,14 +36,15 @@ def evaluate(c, i, want):
 @inner
 def follow_spring(c, i, eps, y, f, want):
     """Fill the values of a spring at a strain, and the rates of its relaxation terms; return T."""
-    s, n = spring(c, i), numbers(c, i)
+    s, n, known = spring(c, i), numbers(c, i), 0.0
     if n.by_stress and c.solved:
-        contract.call_number(n.settle, past(s, c.row), s, eps)
+        known = contract.call_number(n.settle, past(s, c.row), s, eps)
     else:
         for k in range(n.internals):
             s.xs[k] = y[n.x_at + k]
     s.eps = eps
-    evaluate(c, i, contract.PATHS if n.fixed and n.internal else want)
+    if want or known == 0.0:
+        evaluate(c, i, contract.PATHS if n.fixed and n.internal else want)
     sigma, tangent, drift = s.sigma, s.slope, 0.0
     if n.internal and n.fixed:
         call_inside(c, PATH, i, c.none, y, f, y, y)

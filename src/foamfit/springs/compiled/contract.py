@@ -329,5 +329,7 @@ evaluating, call_evaluate = pointed(
 )
 switching, call_switch = pointed(REAL, REALS_AT, SPRING, WHOLE, REALS_AT)
 beginning, call_begin = pointed(REAL, REALS_AT, SPRING)
-settling, call_number = pointed(REAL, REALS_AT, SPRING, REAL)  #: `settle` or `strain`
+settling, call_number = pointed(
+    REAL, REALS_AT, SPRING, REAL
+)  #: `strain`, or `settle`, which returns 1 if it fills stress and slope, else 0
 inverting = settling

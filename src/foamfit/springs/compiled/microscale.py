@@ -80,7 +80,8 @@ def _end(row, s, high, sigma):
 def _no_less(row, s, high):
     """Raise an end of the branch to the least strain at which a micro-spring may snap."""
     if (s.high if high else s.low) < mix.LEAST_STRAIN:
-        _put_end(s, high, mix.LEAST_STRAIN, mix.stress_in(row, s, mix.LEAST_STRAIN))
+        sigma, _ = mix.stress_in(row, s, mix.LEAST_STRAIN)
+        _put_end(s, high, mix.LEAST_STRAIN, sigma)
         s.flexibility = 0.0  # it is not that of the present stress
 
 
@@ -225,9 +226,11 @@ def begin(row, s):
 @contract.settling
 def settle(row, s, eps):
     row, s = mix.as_row(row), mix.as_microscale(s)
-    sigma = mix.stress_in(row, s, eps)
-    s.eps, s.x = eps, sigma
-    return sigma
+    sigma, soft = mix.stress_in(row, s, eps)
+    s.eps = eps
+    s.x = s.sigma = sigma
+    s.slope, s.miss = 1.0 / soft, 0.0
+    return 1.0 if soft > 0.0 else 0.0
 
 
 @contract.inverting

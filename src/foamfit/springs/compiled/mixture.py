@@ -184,16 +184,16 @@ def _halfway(low, high, sigma):
 
 @inner
 def stress_in(row, s, eps):
-    """Return the stress at a strain on the branch; infinite past its end.
+    """Return the stress at a strain on the branch, infinite past its end, and dε/dσ, 0 if unknown.
 
     The method is Halley's inside a bracket, from a parabola at the previous point.
     """
     branch = int(s.branch)
     reach = 1.0 + (row.star if moves(branch) or s.snapped > 0.0 else 0.0)
     if not eps < reach:
-        return math.inf
+        return math.inf, 0.0
     if branch == A and (s.never == 1.0 or eps == 0.0):
-        return stress_on_a(row.n, row.k0, eps)
+        return stress_on_a(row.n, row.k0, eps), 0.0
     sigma, slope, low, high = s.x, s.flexibility, -math.inf, math.inf
     bounded = not slope > 0.0
     if bounded:
@@ -214,7 +214,7 @@ def stress_in(row, s, eps):
         new = sigma - step
         if abs(step) <= NEAR * abs(sigma) * narrow and low <= new <= high:
             s.flexibility, s.curvature = slope + bend * (new - sigma), bend
-            return new
+            return new, s.flexibility
         if not bounded:  # the initial guess did not suffice
             low, high = _ends_of_stress(row, s, eps)
             bounded = True
@@ -228,6 +228,6 @@ def stress_in(row, s, eps):
         if not low < new < high:
             new = _halfway(low, high, sigma)
             if not low < new < high:  # neighbouring floating-point numbers
-                return sigma
+                return sigma, 0.0
         sigma = new
-    return sigma
+    return sigma, 0.0
