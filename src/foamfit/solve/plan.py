@@ -107,7 +107,7 @@ class Plan:
     max_steps: int
     max_explicit: int  #: explicit steps before implicit ones are tried
     damped: bool  #: whether a spring may have a dashpot
-    least: float = LEAST_VIBRATING  #: least error of an implicit step of undamped springs
+    least: float | None = None  #: least error of a step; None: that of the method
     implicit: bool | None = None  #: whether steps are implicit; None: only in stiff scenes
 
     def changed(self, **values: object) -> Plan:
@@ -195,7 +195,8 @@ class Plan:
         if outcome == scenes.DONE and everything and told.item(SWITCHES) > logged:
             more = int(told.item(SWITCHES))
             return self._integrated(rows, heights, rtol, drag, directions, everything, more)
-        return self._motion(out, RADAU if degree else EXPLICIT_STEPS, told, log, rows)
+        method = RADAU if degree else EXPLICIT_STEPS
+        return self._motion(out, method, told, log, rows, reals.item(loop.TOL))
 
     def _methods(self, rows: Array, heights: Array, drag: float, damped: bytes) -> tuple[int, ...]:
         """Return the degrees of the methods to try: 0 for explicit steps.
@@ -215,12 +216,13 @@ class Plan:
         followed: bool = False,
     ) -> Array:  # fmt: skip
         """Return the numbers that the loop over time is given; see `loop`."""
-        least = LEAST_OF_MASSES if len(self.ends) > 1 else LEAST_TOL
+        least = self.least or (LEAST_OF_MASSES if len(self.ends) > 1 else LEAST_TOL)
         tol, most, brief, over = max(self.margin * rtol, least), self.max_steps, 0.0, False
         if degree:
             damped = bool(rows[:, 0].any())
             factor = OF_IMPLICIT if len(self.ends) == 1 else OF_IMPLICIT_MASSES
-            tol = max(factor * rtol, LEAST_TOL if damped else self.least)
+            least = self.least or (LEAST_TOL if damped else LEAST_VIBRATING)
+            tol = max(factor * rtol, least)
             most = min(most, MOST_IMPLICIT_WORK // len(heights))
             first, lasts = self._slopes(rows)[0].tolist(), self._duration
             springs = first, rows[:, 0].tolist(), heights.tolist()
@@ -272,9 +274,11 @@ class Plan:
             memory, end = told[len(NOW) + words[AT["row"]] :], told.item(ENDED)
             log = aggregate.nodes_and_switches(memory, heights, log[:, 0], self.time, end, out)
             told[SWITCHES], told[FINITE] = len(log), np.isfinite(out[0]).all()
-        return self._motion(out, AGGREGATE, told, log, rows)
+        return self._motion(out, AGGREGATE, told, log, rows, reals.item(loop.TOL))
 
-    def _motion(self, out: Array, method: str, told: Array, log: Array, rows: Array) -> Motion:
+    def _motion(
+        self, out: Array, method: str, told: Array, log: Array, rows: Array, tol: float
+    ) -> Motion:
         """Return the result of a run as a Motion; raise SimulationError if it failed."""
         outcome, time, steps, switches, finite, strongest, *damped = told[:TOLD].tolist()
         if outcome != scenes.DONE or not finite:
@@ -285,7 +289,7 @@ class Plan:
         log, lost = log[: int(switches)], loop.lost(strongest, *damped) if method == RADAU else 0.0
         first = out[0]
         return Motion(
-            first[1:], first[0], time, log, int(steps), method, slopes, lost, strongest
+            first[1:], first[0], time, log, int(steps), method, slopes, lost, strongest, tol
         )  # fmt: skip
 
     # ------------------------------------------------------------------ without integration

@@ -54,6 +54,7 @@ class Motion:
     slopes: Slopes | None = None  #: None if no derivatives were requested
     unresolved: float = 0.0  #: size of damped-out vibrations, relative to the ranges
     strongest: float = 0.0  #: largest stress at an end of a step, Pa
+    tol: float = 0.0  #: allowed error of a step
 
 
 def difference(one: Array, other: Array) -> float:

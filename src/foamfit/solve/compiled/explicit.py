@@ -171,16 +171,20 @@ def step(c, want, tol, upto, most):
             if r.taken >= most:
                 return events.FAILED
             continue
-        grow = min(6.0, 0.88 * error**-0.125) if error > 1e-8 else 6.0
+        grow = 6.0
+        if error > 1e-8:
+            grow = min(6.0, max(0.3, 0.9 * error**-0.115 * r.last**0.02))
         r.grow = min(grow, 1.0) if again else grow
         doubtful = events.suspicious(c, dt)
         if not doubtful and upto > r.now + dt:
+            r.last = max(error, 1e-4)
             return events.PLAIN
         size = make_dense(c, n, dt, at, tol, want)
         if size > 1.0 and dt > 1e-12 * abs(r.horizon):
             again = True
             r.step = dt * max(0.3, AIMED * size**-0.143)
             continue
+        r.last = max(error, 1e-4)
         if size * r.grow**7 > AIMED**7:
             r.grow = AIMED * size**-0.143
         return events.DOUBTFUL if doubtful else events.SAMPLED
