@@ -384,7 +384,7 @@ def test_a_dask_cluster_loses_a_worker_and_no_test(here):
     distributed = pytest.importorskip("distributed")
     (here / "tests/bad.csv").unlink()
     (here / "elsewhere").mkdir()
-    with distributed.LocalCluster(n_workers=0, dashboard_address=None) as cluster:
+    with distributed.LocalCluster(n_workers=0, dashboard_address=":0") as cluster:
         call = [sys.executable, "-m", "distributed.cli.dask_worker", cluster.scheduler_address]
         call += ["--nthreads", "1", "--no-nanny", "--no-dashboard"]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
