@@ -4,13 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_memory import value_of, with_value
 
 import foamfit as ff
 from foamfit.errors import SimulationError
 from foamfit.solve.plan import Plan
 from independent import over_range
-from reference import differences
 
 AREA, H = 1e-3, 10e-3
 SHOE = ff.MicroscaleSpring(5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77)
@@ -75,29 +73,6 @@ def test_no_origin_of_time_takes_digits(eta) -> None:
     np.testing.assert_array_equal(runs[1].base_stress, runs[0].base_stress)
     np.testing.assert_array_equal(runs[1].displacement, runs[0].displacement)
     np.testing.assert_allclose(runs[1].switches[:, 0] - origin, runs[0].switches[:, 0], atol=step)
-
-
-def test_derivatives_under_a_known_motion_are_those_of_differences() -> None:
-    """A rank that stays constant depends on the stress at the turn, and so on the other springs."""
-    springs = [SHOE, replace(SHOE, k0=8e5, sigma_plus=2e5, spread_minus=0.3), SOFT]
-    given, time = ff.Chain(springs, [H, 2 * H, H], AREA), np.linspace(0.0, 1.0, 97)
-    top = np.interp(time, np.linspace(0.0, 1.0, 7), 4 * H * np.array(TURNS))
-    names = ["s1_k0", "s1_kc", "s1_eps_star", "s1_sigma_plus", "s1_spread_plus", "s2_sigma_minus",
-             "s2_spread_minus", "s3_k0", "s3_eps_a", "s3_kh_plus", "s2_height"]  # fmt: skip
-
-    def run(chain: ff.Chain, **more) -> ff.Response:
-        return ff.simulate(chain, ff.DisplacementDrive(top), time, **more)
-
-    got = run(given, sensitivities=names)
-    for name in names:
-        value = value_of(given, name)
-        both = differences(
-            lambda by, name=name, value=value: run(with_value(given, name, value + by)),
-            1e-5 * value, 2,
-        )  # fmt: skip
-        for what, want in zip(("displacement", "base_stress"), both, strict=True):
-            mine = getattr(got.sensitivities[name], what)
-            assert np.abs(mine - want).max() <= 1e-5 * np.abs(want).max(), (name, what)
 
 
 def test_a_top_that_is_not_where_it_was_prescribed_is_refused(monkeypatch) -> None:

@@ -91,6 +91,7 @@ SCENES: dict[str, tuple[ff.Chain, Drive]] = {
         chain([GAP, relaxing(MICRO)], [1e-3, 0.0]), IMPACT),
     "impact, gap between masses": (chain([relaxing(FOAM), GAP], [2e-3, 0.0]), IMPACT),
     "motion of two": (chain([LINEAR, MICRO]), MOVED),
+    "motion of three": (chain([FOAM, WIDE, BISTABLE]), motion(0.4e-3)),
     "motion of two, relaxing": (chain([relaxing(FOAM), relaxing(MICRO, TWO)]), MOVED),
     "motion of two, bistable": (chain([relaxing(BISTABLE), relaxing(MICRO)]), MOVED),
     "motion of two, one damped": (chain([relaxing(FOAM), damped(MICRO, 200.0)]), MOVED),
@@ -165,7 +166,7 @@ def changed(given: ff.Chain, drive: Drive, name: str, by: float) -> ff.Response:
 
 
 # Rounding makes springs reverse repeatedly here, which stops the judge.
-TURNING = ("motion of two", "impact, gap between masses", "stress, viscous top")
+TURNING = ("motion of two", "motion of three", "impact, gap between masses", "stress, viscous top")
 
 
 @pytest.mark.parametrize("name", [name for name in SCENES if name not in TURNING])
@@ -208,6 +209,7 @@ EXACT = [
     "impact, two terms, dashpot, onsite damper", "impact, wide", "impact, hysteretic below",
     "impact, hysteretic above", "impact, bistable relaxing", "impact on three",
     "motion of two, relaxing", "motion of two, both damped", "motion of two, interior mass",
+    "motion of three",
     "stress on two, one damped", "stress, viscous top", "impact, gap between masses",
     "impact, interior mass, two microscale",
     "impact, remembering, relaxation, dashpot", "impact, remembering, interior mass",

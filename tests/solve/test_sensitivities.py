@@ -41,6 +41,7 @@ SCENES: dict[str, tuple[ff.Chain, Drive]] = {
     "one of three damped": (chain(damped([*PAIR, BISTABLE], 0.0, 30.0, 0.0)), IMPACT),
     "unilateral": (chain([HELD, SOFT], site=30.0), IMPACT),
     "unilateral, mass": (chain([HELD, BISTABLE], [5e-6, 0.0]), ff.Impact(7e-3, 0.7)),
+    "gravity": (chain(PAIR, [5e-5, 0.0], 30.0), ff.Impact(7e-3, 2.0, 2e3)),
     "motion": (chain([BISTABLE]), MOTION),
     "motion, dashpot": (chain(damped([BISTABLE], 20.0)), MOTION),
     "motion of two": (chain(PAIR), MOTION),
@@ -70,7 +71,8 @@ FEW = {
 # Tighter tolerances take too long, and at this one second-order differences are accurate enough.
 STIFF: dict[str, tuple[ff.Chain, Drive]] = {
     "stiff: heavy and light dashpot": (chain(damped(PAIR, 1e5, 1e-2)), IMPACT),
-    "stiff: light mass, onsite damper": (chain(damped(PAIR, 50.0, 30.0), [1e-8, 0.0], 1e3), IMPACT),
+    "stiff: light mass, onsite damper, gravity": (
+        chain(damped(PAIR, 50.0, 30.0), [1e-8, 0.0], 1e3), ff.Impact(7e-3, 2.0, 2e3)),
     "stiff: one of three damped": (chain(damped([*PAIR, BISTABLE], 0.0, 1e-2, 0.0)), IMPACT),
     "stiff: motion of two": (chain(damped(PAIR, 1e-2, 1e-2)), FEW["moved"]),
     "stiff: motion that opens a gap": (
@@ -78,7 +80,7 @@ STIFF: dict[str, tuple[ff.Chain, Drive]] = {
         FEW["pulled"],
     ),
     "stiff: stress, viscous top": (chain(damped(PAIR, 0.0, 1e-1), site=300.0), FEW["stress"]),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("label", [*SCENES, *STIFF])
@@ -121,7 +123,6 @@ def with_change(drive: Drive, what: int, by: float) -> Drive:
 
 
 BY_DRIVE = {label: one for label, one in SCENES.items() if not isinstance(one[1], ff.StressDrive)}
-BY_DRIVE["impact with gravity"] = (chain(PAIR, [5e-5, 0.0], 30.0), ff.Impact(7e-3, 2.0, 2e3))
 SIZES = {MOVED_BY: 5e-4, BEGUN: TIME[-1], STRUCK: 2.0, HEAVIER: 7e-3 / AREA}
 
 

@@ -11,6 +11,7 @@ import pytest
 import foamfit as ff
 from foamfit import Chain
 from foamfit import LinearSpring as Linear
+from foamfit.solve.plan import plan
 from independent import Truth, follow
 from reference import law
 from strategies import with_ratios
@@ -190,36 +191,28 @@ def impact(name: str, n: int = 4001, rtol: float = 1e-9) -> tuple[ff.Response, n
     return got, strain, rebound
 
 
-def test_foam_1_rebounds_without_loss() -> None:
-    got, strain, rebound = impact("model-1")
-    assert f"{strain.max():.3f}" == "0.322"
-    assert strain.max() < law(MODEL_1).eps_hat_c
-    assert rebound == pytest.approx(1.75, rel=1e-8)
+@pytest.mark.parametrize(
+    ("name", "peak", "rebound", "off"),
+    [
+        ("model-1", "0.322", 1.75, 1.75e-8),
+        ("model-3", "0.704", 1.75, 1.75e-8),  # 0.705 with its mass, as published
+        ("model-3, mass", "0.705", 1.75, 1.75e-4),  # a little energy remains in its vibration
+        ("foam-2, mass", "0.767", 2.17, 5e-3),
+        ("foam-2", "0.767", 2.19, 5e-3),  # nothing vibrates: slightly faster
+    ],
+)
+def test_strain_and_rebound_are_the_published_ones(
+    name: str, peak: str, rebound: float, off: float
+) -> None:
+    """Foam-1 rebounds without loss, foam-2 closes its loop: with the interior mass, undamped."""
+    got, strain, found = impact(name)
+    assert f"{strain[-1].max():.3f}" == peak
+    assert found == pytest.approx(rebound, abs=off)
+    closed = name.startswith("foam-2")
+    assert (strain[-1].max() > law(CHAINS[name].springs[-1]).eps_hat_c) == closed
     assert got.base_stress.min() >= 0.0
-
-
-def test_foam_1_with_two_springs_rebounds_without_loss() -> None:
-    _, strain, rebound = impact("model-3")
-    assert strain[1].max() == pytest.approx(0.705, abs=1e-3)
-    assert rebound == pytest.approx(1.75, rel=1e-8)
-    # a little energy remains in the vibration of the interior mass
-    _, strain, rebound = impact("model-3, mass")
-    assert f"{strain[1].max():.3f}" == "0.705"
-    assert rebound == pytest.approx(1.75, rel=1e-4)
-
-
-def test_foam_2_closes_its_loop() -> None:
-    """The published numbers are those of the chain with the interior mass and without dampers."""
-    got, strain, rebound = impact("foam-2, mass")
-    assert f"{strain[1].max():.3f}" == "0.767"
-    assert strain[1].max() > law(TOP_2).eps_hat_c
-    assert f"{got.base_stress.max() / 1e6:.1f}" == "17.4"
-    assert f"{rebound:.2f}" == "2.17"
-    # without the interior mass nothing vibrates, and the rebound is slightly faster
-    got, strain, rebound = impact("foam-2")
-    assert f"{strain[1].max():.3f}" == "0.767"
-    assert f"{got.base_stress.max() / 1e6:.1f}" == "17.4"
-    assert f"{rebound:.2f}" == "2.19"
+    if closed:
+        assert f"{got.base_stress.max() / 1e6:.1f}" == "17.4"
 
 
 @pytest.mark.parametrize(
@@ -366,18 +359,13 @@ def test_inadmissible_chains_are_refused_by_name(change: dict[str, object], name
         ({"t": None}, "t must be an array of numbers"),
         ({"t": "1 ms"}, "t must be an array of numbers"),
         ({"rtol": "1e-6"}, "rtol = '1e-6' is not admissible: it must be a number"),
+        *(({"rtol": one}, f"rtol = {one:g}") for one in (0.0, -1e-6, math.nan, math.inf)),
     ],
 )
 def test_what_is_no_scene_is_refused_by_name(change: dict[str, Any], words: str) -> None:
     good: dict[str, Any] = {"chain": SCENE, "drive": ff.Impact(7e-3, 1.0), "t": GOOD}
     with pytest.raises(ValueError, match=rf"^{words}"):
         ff.simulate(**(good | change))
-
-
-@pytest.mark.parametrize("rtol", [0.0, -1e-6, math.nan, math.inf])
-def test_inadmissible_tolerance_is_refused(rtol: float) -> None:
-    with pytest.raises(ValueError, match=r"\brtol\b"):
-        ff.simulate(SCENE, ff.Impact(7e-3, 1.0), GOOD, rtol=rtol)
 
 
 @pytest.mark.parametrize(
@@ -435,13 +423,18 @@ def test_contact_ends_wherever_in_the_chain_a_gap_opens(speed: float) -> None:
 def test_a_gap_stays_closed_while_the_stress_rests_at_zero(
     more: dict[str, Any], mass: float, samples: int
 ) -> None:
-    """A prescribed stress that never pulls, and rests at zero: as without a gap."""
+    """A prescribed stress that never pulls, and rests at zero: as without a gap.
+
+    Without the checks of `simulate`: under no stress an open gap may have any width, and rounding
+    decides whether steps become short there, so that it takes a vibration for unresolved.
+    """
     below = ff.MicroscaleSpring(5.5e6, 2.5e6, 0.3, 1.3e6, 0.4, 5.5e5, 0.6, **more)
     t = np.linspace(0.0, 0.3, samples)
     drive = ff.StressDrive(np.maximum(4e4 * np.sin(np.pi * t / 0.1) ** 2 - 1e4, 0.0))
+    springs = [(below, one) for one in (Linear(2e5, unilateral=True), Linear(2e5))]
+    chains = [Chain(pair, [1.9e-3, 1.7e-3], 2e-5, [mass, 0.0]) for pair in springs]
     with_gap, without = (
-        ff.simulate(ff.Chain([below, one], [1.9e-3, 1.7e-3], 2e-5, [mass, 0.0]), drive, t)
-        for one in (Linear(2e5, unilateral=True), Linear(2e5))
+        plan(chain, drive, t).run(*chain.arrays[:2], 1e-6 if mass else 1e-9) for chain in chains
     )
     wanted = without.displacement
     assert np.abs(with_gap.displacement - wanted).max() < 1e-6 * np.ptp(wanted)
