@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,9 @@ os.environ["COLUMNS"] = "100"  # the same output width in every terminal
 posix = pytest.mark.skipif(os.name != "posix", reason="signals, permissions and shell of POSIX")
 needs_data = pytest.mark.skipif(
     not DATA.is_dir(), reason="the measurements of others are not beside this checkout"
+)
+needs_panel = pytest.mark.skipif(
+    find_spec("panel") is None, reason='the page needs Panel: pip install "foamfit[page]"'
 )
 
 
@@ -112,15 +116,24 @@ def compiled() -> None:
         precompile.compile_solver()
 
 
-def run(*args: object, encoding: str = "utf-8") -> Result:
-    """Call a command of foamfit in a terminal of this encoding."""
-    return CliRunner(charset=encoding).invoke(main, [str(arg) for arg in args])
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Change to an empty directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(*args: object, code: int | tuple[int, ...] = 0, encoding: str = "utf-8") -> Result:
+    """Call a command of foamfit that ends with (one of) these exit codes, in a terminal."""
+    told = CliRunner(charset=encoding).invoke(main, [str(arg) for arg in args])
+    assert told.exit_code in np.atleast_1d(code), told.output
+    return told
 
 
 def run_refused(*args: object) -> str:
     """Call a command that must be refused; return its only sentence."""
-    told = run(*args)
-    assert (told.exit_code, told.stdout) == (1, ""), told.output
+    told = run(*args, code=1)
+    assert told.stdout == "", told.output
     assert re.fullmatch(r"foamfit: [^\n]+\n", told.stderr)
     assert "defect" not in told.stderr
     return told.stderr
@@ -255,11 +268,12 @@ def synthetic_loop(noise: float = 0.005) -> tuple[ff.BistableSpring, Measurement
 
 
 def loop_measurement(
-    stress: np.ndarray, motion: np.ndarray, specimen: Specimen, time: np.ndarray | None = None
-) -> Measurement:
-    """Return a measured loop of stress (Pa) and displacement (m), with or without time (s)."""
+    stress: np.ndarray, motion: np.ndarray, specimen: Specimen, time: np.ndarray | None = None,
+    striker: Striker | None = None,
+) -> Measurement:  # fmt: skip
+    """Return a test of stress (Pa) and motion (m), with or without time (s) and striker."""
     return Measurement(
-        "synthetic loop", None, "", time, stress, motion, specimen, motion="measured"
+        "synthetic", None, "", time, stress, motion, specimen, striker, motion="measured"
     )
 
 

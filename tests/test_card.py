@@ -332,12 +332,9 @@ def test_an_unknown_density_is_no_number(tmp_path: Path, fit: Path) -> None:
 # ------------------------------------------------------------------------------- files, refusals
 
 
-def test_the_command_writes_card_numbers_and_picture(
-    fit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("here")
+def test_the_command_writes_card_numbers_and_picture(fit: Path) -> None:
     done = run("card", fit, "--format", "mat083", "--rates", "0.25,10")
-    assert done.exit_code == 0, done.output
     card = f"{fit.parent.name}-foam-mat083.k"
     assert f"cards/{card}" in done.output
     names = [card, *(f"{card}.{one}" for one in ("json", "pdf", "png"))]
@@ -368,11 +365,10 @@ def test_the_command_writes_card_numbers_and_picture(
     ],
 )
 def test_a_wrong_call_is_one_sentence_and_writes_nothing(
-    fit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: list[str], words: str
+    fit: Path, here: Path, given: list[str], words: str
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     assert words in run_refused("card", fit, *given)
-    assert not list(tmp_path.iterdir())
+    assert not list(here.iterdir())
 
 
 def test_a_result_without_a_card_is_refused(tmp_path: Path, fit: Path, joint: Path) -> None:

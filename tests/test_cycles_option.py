@@ -80,8 +80,7 @@ def test_one_set_of_parameters_for_all_cycles_and_the_next(record: Path, tmp_pat
     """Parameters identified from cycles 1 to 3 of the file predict the fourth cycle."""
     call = ["fit", str(record), "--model", "microscale", "--stiffening", "--mullins"]
     call += ["--cycles", "1-3", "--starts", "3", "--out", str(tmp_path / "fit"), "--quiet"]
-    told = run(*call, "--no-report")
-    assert told.exit_code == 0, told.output
+    run(*call, "--no-report")
     content = json.loads((tmp_path / "fit" / "fit.json").read_text())
     assert (content["model"], content["stiffening"], content["mullins"]) == (
         "microscale", True, True,
@@ -92,9 +91,8 @@ def test_one_set_of_parameters_for_all_cycles_and_the_next(record: Path, tmp_pat
         found = content["parameters"][f"s1_{name}"]
         assert abs(found["value"] - getattr(TRUTH, name)) < 4.0 * found["stderr"], name
         assert found["state"] == "determined"
-    said = run("predict", str(tmp_path / "fit"), str(record), "--cycles", "1-4", "--draws", "60",
-         "--out", str(tmp_path / "next"), "--quiet", "--no-report")  # fmt: skip
-    assert said.exit_code == 0, said.output
+    run("predict", tmp_path / "fit", record, "--cycles", "1-4", "--draws", "60",
+        "--out", tmp_path / "next", "--quiet", "--no-report")  # fmt: skip
     found = json.loads((tmp_path / "next" / "prediction.json").read_text())["by_cycle"]
     assert list(found) == ["1", "2", "3", "4"]
     assert found["4"]["misfit"] < 0.01

@@ -26,30 +26,29 @@ def blocks(page, *languages):
 @pytest.fixture(scope="module")
 def fitted():
     """The fit of the reconstruction that the pages use."""
-    return ff.fit(ff.read_test(RECONSTRUCTION), model="bistable")
+    return ff.fit(ff.read_test(RECONSTRUCTION), model="bistable", starts=2)
 
 
 @pytest.fixture
-def place(tmp_path, monkeypatch, fitted):
+def place(here, monkeypatch, fitted):
     """A folder like that of a user, in which fits and pictures take little time."""
-    (tmp_path / "experiments").symlink_to(ROOT / "experiments")
-    shutil.copy(RECONSTRUCTION, tmp_path / "TEST.csv")
-    shutil.copy(RECONSTRUCTION.with_suffix(".toml"), tmp_path / "TEST.toml")
-    shutil.copy(ROOT / "notebooks/bouc_wen.py", tmp_path)
-    fitted.save(tmp_path / "fits/TEST/bistable", report=False)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
+    (here / "experiments").symlink_to(ROOT / "experiments")
+    shutil.copy(RECONSTRUCTION, here / "TEST.csv")
+    shutil.copy(RECONSTRUCTION.with_suffix(".toml"), here / "TEST.toml")
+    shutil.copy(ROOT / "notebooks/bouc_wen.py", here)
+    fitted.save(here / "fits/TEST/bistable", report=False)
+    monkeypatch.syspath_prepend(here)
     small_pictures(monkeypatch)
     own = ff.fit
 
     def fit(test, model="bistable", **more):
-        quick = {"starts": 1, "intervals": "local"}
+        quick = {"starts": 2, "intervals": "local", "max_time": 1.0}
         return own(test, model=model, **quick | more) if more or model != "bistable" else fitted
 
     monkeypatch.setattr(ff, "fit", fit)
     monkeypatch.setattr(laws, "_LAWS", dict(laws._LAWS))
     monkeypatch.setattr(laws, "_TEXTS", dict(laws._TEXTS))
-    return tmp_path
+    return here
 
 
 @pytest.mark.parametrize(

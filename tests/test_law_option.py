@@ -43,9 +43,8 @@ def cubic(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Change to a folder with two tests of the law; registered laws are removed after each test."""
-    monkeypatch.chdir(tmp_path)
+def tests(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write two tests of the law; registered laws are removed after each test."""
     monkeypatch.setattr(laws, "_LAWS", dict(laws._LAWS))
     monkeypatch.setattr(laws, "_TEXTS", dict(laws._TEXTS))
     without_pictures(monkeypatch)
@@ -55,8 +54,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         noise = 500.0 * np.random.default_rng(seed).standard_normal(strain.size)
         head = "time (s),stress (Pa),strain"
         columns = np.arange(61), stress + noise, strain
-        write_csv(tmp_path / f"t{seed}.csv", head, *columns, toml=SPECIMEN)
-    return tmp_path
+        write_csv(here / f"t{seed}.csv", head, *columns, toml=SPECIMEN)
 
 
 def test_a_law_of_a_file_simulates(here: Path, cubic: Path) -> None:
@@ -66,7 +64,7 @@ def test_a_law_of_a_file_simulates(here: Path, cubic: Path) -> None:
         'k = "0.2 MPa"\nq = "1 MPa"\n[drive]\nkind = "displacement"\nfile = "drive.csv"\n'
     )
     assert "kind = 'cubic'" in run_refused("simulate", "scene.toml")
-    assert run("simulate", "scene.toml", "--law", cubic).exit_code == 0
+    run("simulate", "scene.toml", "--law", cubic)
     stress, strain = np.loadtxt(here / "scene.csv", delimiter=",", skiprows=1).T[1:3]
     np.testing.assert_allclose(strain, [0.0, 0.2, 0.4, 0.0], atol=1e-12)
     np.testing.assert_allclose(stress, 2e5 * strain + 1e6 * strain**3, rtol=1e-9, atol=1e-6)
@@ -77,7 +75,6 @@ def test_a_law_of_a_file_is_fitted_and_predicts(
 ) -> None:
     asked = ("--model", "cubic", "--law", cubic, "--starts", 2, "--out", "r", "--json")
     told = run("fit", "t1.csv", *asked)
-    assert told.exit_code == 0, told.output
     found = json.loads(told.stdout)["parameters"]
     for name, true in TRUE.items():
         assert found[name]["state"] == "determined"
@@ -85,7 +82,6 @@ def test_a_law_of_a_file_is_fitted_and_predicts(
     monkeypatch.setattr(laws, "_LAWS", {k: v for k, v in laws._LAWS.items() if k != "cubic"})
     assert "'cubic' is not a spring" in run_refused("predict", "r", "t2.csv")
     told = run("predict", "r", "t2.csv", "--law", cubic, "--json", "--no-report")
-    assert told.exit_code == 0, told.output
     assert json.loads(told.stdout)["misfit"]["stress_strain"] < 0.01
 
 
@@ -94,7 +90,6 @@ def test_processes_of_a_batch_know_the_law_as_it_is_now(here: Path) -> None:
     (here / "cubic.py").write_text(LAW)
     asked = ("t1.csv", "--model", "cubic", "--law", "cubic.py", "--starts", 1, "--jobs", 1)
     told = run("batch", *asked, "--json", "--no-report", "--out", "b")
-    assert told.exit_code == 0, told.output
     (first,) = json.loads(told.stdout)
     assert first["s1_q"] == pytest.approx(TRUE["s1_q"], rel=0.02)
     (here / "cubic.py").write_text(LAW.replace("strain**3", "strain**2"))

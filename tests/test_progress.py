@@ -50,9 +50,8 @@ def terminal() -> Iterator[Terminal]:
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def quick(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Use an empty directory, no pictures, and a line that draws every update."""
-    monkeypatch.chdir(tmp_path)
     without_pictures(monkeypatch)
     monkeypatch.setattr(module, "REDRAWN", 0.0)
     monkeypatch.setattr(module, "APART", 0.0)

@@ -151,37 +151,33 @@ def test_a_shift_without_two_channels_in_time_is_refused(changed, missing):
     assert "time shift" in str(caught.value)
 
 
-def test_a_stopped_fit_is_marked_everywhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_stopped_fit_is_marked_everywhere(here, monkeypatch):
     small_pictures(monkeypatch)
-    test = fabricated_csv(tmp_path)
-    out = run("fit", str(test), "--max-time", "0.02", "--out", "stopped")
-    assert out.exit_code in (0, 2)
+    test = fabricated_csv(here)
+    out = run("fit", str(test), "--max-time", "0.02", "--out", "stopped", code=(0, 2))
     assert "stopped by the time limit" in out.stdout.splitlines()[0]
-    content = load_result(tmp_path / "stopped")
+    content = load_result(here / "stopped")
     assert content["stopped"] == "the time limit"
     assert content["status"] in ("warnings", "failed")
     assert "stopped by the time limit" in content["warnings"][0]
-    head = (tmp_path / "stopped" / "report.html").read_text().split("</h1>")[1][:400]
+    head = (here / "stopped" / "report.html").read_text().split("</h1>")[1][:400]
     assert "stopped by the time limit" in head
-    text = comparison_text(compare([tmp_path / "stopped"], "foam-1/model-1"))
+    text = comparison_text(compare([here / "stopped"], "foam-1/model-1"))
     assert "stopped by the time limit)" in text.splitlines()[0]
     assert "not those of a finished fit" in " ".join(text.split())
 
 
-def test_sigterm_keeps_the_best_so_far(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_sigterm_keeps_the_best_so_far(here, monkeypatch):
     small_pictures(monkeypatch)
     end = partial(signal.raise_signal, signal.SIGTERM)
     monkeypatch.setattr(one_model, "settle_ends", lambda *_: end())  # stop after the search
-    call = ["fit", str(fabricated_csv(tmp_path)), "--starts", "2", "--out", "stopped"]
+    call = ["fit", str(fabricated_csv(here)), "--starts", "2", "--out", "stopped"]
     out = run(*call)
-    assert (out.exit_code, out.stderr) == (0, "")
+    assert out.stderr == ""
     assert "stopped by SIGTERM" in out.stdout.splitlines()[0]
-    assert load_result(tmp_path / "stopped")["stopped"] == "SIGTERM"
+    assert load_result(here / "stopped")["stopped"] == "SIGTERM"
     monkeypatch.setattr(one_model, "make_problem", lambda *_, **__: end())
-    out = run(*call, "--quiet")
-    assert (out.exit_code, out.stderr.strip()) == (143, "foamfit: ended by SIGTERM")
+    assert run(*call, "--quiet", code=143).stderr.strip() == "foamfit: ended by SIGTERM"
 
 
 def fabricated_csv(folder):

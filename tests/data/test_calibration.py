@@ -170,7 +170,6 @@ def test_check_says_what_contradicts_and_the_line_that_settles_it(tmp_path: Path
     right = record.rig.velocity
     path = rig.write(replace(record, toml_velocity=f"{0.9 * right:.8g} m/s"), tmp_path)
     out = run("check", str(path))
-    assert out.exit_code == 0
     told = " ".join(out.output.split())
     assert f"the velocity is given as {0.9 * right:.4g} m/s, the striker moves at" in told
     assert "before contact" in told

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import DATA, needs_data, run, run_refused
+from conftest import DATA, needs_data, run, run_refused, write_lines
 
 T = np.linspace(0.0, 2.0, 201)
 W = 4.0 * np.sin(0.5 * np.pi * T)
@@ -17,15 +17,12 @@ COUNTS = np.arange(201.0)
 
 def drafted(folder: Path, *head: str, columns: tuple[np.ndarray, ...] = (T, F, W)) -> list[str]:
     """Return the lines of [columns] that init writes for a table."""
-    path = folder / "test.csv"
     rows = [",".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True)]
-    path.write_text("\n".join([*head, *rows]) + "\n", encoding="utf-8")
-    return initialised(path)
+    return initialised(write_lines(folder, [*head, *rows], toml=None))
 
 
 def initialised(path: Path) -> list[str]:
-    out = run("init", str(path))
-    assert out.exit_code == 0, out.stderr
+    run("init", str(path))
     text = path.with_suffix(".toml").read_text(encoding="utf-8")
     tomllib.loads(text)
     lines = text.partition("[columns]\n")[2].partition("\n\n")[0].splitlines()

@@ -37,15 +37,6 @@ def test_an_impact_is_recovered_within_three_standard_errors():
     assert impact_fit.visited == {"s1": ("a", "d", "c", "e")}
 
 
-def test_a_loop_without_time_is_fitted_in_the_displacement_drive():
-    spring, measurement = synthetic_loop()
-    result = ff.fit(measurement)
-    assert result.drive == "displacement"
-    assert result.misfit["stress_strain"] < 0.006
-    assert result.misfit["displacement_time"] is None
-    assert result.parameters["s1_kc"].value == pytest.approx(spring.kc, rel=0.05)
-
-
 def test_a_branch_may_be_moved_by_a_parameter_that_is_not_determined():
     """Branch c fixes eps_star alone; at one eps_c 16 of 25 intervals of kc contained the truth."""
     spring, off = ff.published["foam-1/model-1"].bistable, []

@@ -232,7 +232,6 @@ def test_the_command_prints_and_draws(tmp_path: Path) -> None:
     (tmp_path / "one" / "fit.json").write_text(json.dumps(published_fit().to_json_dict()))
     one, plot = (str(tmp_path / name) for name in ("one", "c.svg"))
     done = run("compare", one, "--plot", plot)
-    assert done.exit_code == 0
     assert "compared with published foam-1/model-1" in done.stdout
     assert Path(plot).is_file()
 

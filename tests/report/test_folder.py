@@ -137,22 +137,6 @@ def test_another_kind_of_result_is_not_replaced(tmp_path: Path) -> None:
     assert not (tmp_path / "slow").exists()
 
 
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        (None, "is not a result folder"),
-        ("{", "not valid JSON"),
-        ("[1]", "not the result of a fit"),
-        ('{"schema": 99}', "schema 99"),
-    ],
-)
-def test_loading_what_is_no_result(tmp_path: Path, text: str | None, complaint: str) -> None:
-    if text is not None:
-        (tmp_path / "fit.json").write_text(text)
-    with pytest.raises(InputError, match=complaint):
-        load_result(tmp_path)
-
-
 def test_the_same_result_gives_the_same_files(saved: Path, tmp_path: Path) -> None:
     again = fabricated.result().save(tmp_path / "again")
     assert all(

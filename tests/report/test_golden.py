@@ -30,7 +30,6 @@ TEST = "experiments/foam-1/model-1-1.75mps-reconstruction.csv"
 
 def printed(*args: object) -> str:
     done = run(*args)
-    assert done.exit_code == 0, done.output
     return done.stdout
 
 

@@ -7,18 +7,17 @@ from foamfit.study.study_file import find_tests
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def here(here):
     """Tests of two days, other files in their folders, and a result."""
-    monkeypatch.chdir(tmp_path)
     files = (
         "monday/a.csv monday/a.toml monday/b.txt monday/specimens.csv monday/picture.png "
         "monday/.hidden.csv tuesday/a.csv tuesday/c.dat tuesday/fits/fit.json "
         "tuesday/fits/curves.csv empty/notes.md"
     )
     for name in files.split():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text("x")
-    return tmp_path
+        (here / name).parent.mkdir(parents=True, exist_ok=True)
+        (here / name).write_text("x")
+    return here
 
 
 def names(*patterns, **options):
