@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import assert_near, write_csv
+from conftest import SPECIMEN, assert_near, write_csv
 from foamfit.data.blocks import without_holds
 from foamfit.data.energy import audit
 from foamfit.data.measurement import Record
@@ -16,7 +16,6 @@ LAW = {
     "sigma_minus": 6e4, "spread_minus": 0.5,
 }  # fmt: skip
 TERM = {"g1": 0.4, "tau1": 0.5}
-TOML = '[specimen]\nheight = "10 mm"\narea = "1 cm^2"\n'
 STEPS = [p for k in range(6) for p in ((10.2 * k, 0.1 * k), (10.2 * k + 0.2, 0.1 * k + 0.1))]
 HELD = 1.0 + np.geomspace(3e-3, 299.9, 200)  # as a logger with a logarithmic clock writes it
 UNEVEN = np.concatenate([np.linspace(0.0, 1.0, 301), HELD, np.linspace(301.0, 302.0, 301)])
@@ -50,12 +49,12 @@ def record(folder: Path, name: str, copies: int = 1) -> Path:
     read = [np.maximum(stress, 0.0) / 1e3 + 2e-6 * np.ptp(stress) * noise[0]]
     rows = np.repeat([time, *read, 10.0 * strain + 5e-4 * noise[1]], copies, axis=1)
     head = "time (s),stress (kPa),displacement (mm)"
-    return write_csv(folder / "slow.csv", head, *rows, fmt="%.6f", toml=TOML)
+    return write_csv(folder / "slow.csv", head, *rows, fmt="%.6f", toml=SPECIMEN)
 
 
-def fitted(path: Path, **chosen: object) -> ff.FitResult:
-    test = ff.read_test(path, **chosen)
-    return ff.fit(test, model="microscale", relaxation=1, intervals="local", starts=8)
+def fitted(path: Path, drive: str | None = None, **chosen: object) -> ff.FitResult:
+    options = {"drive": drive, "intervals": "local", "starts": 8}
+    return ff.fit(ff.read_test(path, **chosen), model="microscale", relaxation=1, **options)
 
 
 @pytest.mark.parametrize(
@@ -93,9 +92,8 @@ def test_steps_of_a_driving_stress_all_count(tmp_path: Path) -> None:
     noise = np.random.default_rng(5).standard_normal((2, time.size))
     rows = time, stress / 1e3 + 0.5 * noise[0], 1e3 * motion + 5e-4 * noise[1]
     head = "time (s),stress (kPa),displacement (mm)"
-    path = write_csv(tmp_path / "slow.csv", head, *rows, fmt="%.6f", toml=TOML)
-    found = ff.fit(ff.read_test(path), model="microscale", relaxation=1, drive="stress", starts=8)
-    assert_near(found, LAW | TERM, 4.0)
+    path = write_csv(tmp_path / "slow.csv", head, *rows, fmt="%.6f", toml=SPECIMEN)
+    assert_near(fitted(path, drive="stress"), LAW | TERM, 4.0)
 
 
 def test_noisy_cycles_are_no_rest() -> None:
@@ -127,7 +125,7 @@ def test_the_energy_of_several_cycles_is_that_up_to_the_first_peak(tmp_path: Pat
 def test_a_record_that_ends_under_load_determines_nothing_if_the_law_errs(tmp_path: Path) -> None:
     """Without the last tenth of the unloading sigma_minus moved by more than its range."""
     path = record(tmp_path, "no rest")
-    path.with_suffix(".toml").write_text(TOML + '[window]\nstart = "0 s"\nend = "3.2 s"\n')
+    path.with_suffix(".toml").write_text(SPECIMEN + '[window]\nstart = "0 s"\nend = "3.2 s"\n')
     found = ff.fit(ff.read_test(path), starts=8)
     states = {p.state for p in found.parameters.values() if p.vary}
     assert "determined" not in states

@@ -17,10 +17,9 @@ TOML = (
 
 @pytest.mark.parametrize("gauge", [True, False])
 @pytest.mark.parametrize("stated", [True, False])
-@pytest.mark.parametrize("seed", [3, 4])
-def test_a_late_motion_is_found(tmp_path, seed, stated, gauge):
+def test_a_late_motion_is_found(tmp_path, stated, gauge):
     """Before contact the gauge rests, or else follows the striker; its clock may have a ±."""
-    made = rig.impact(rig.Impact(delay_sd=0.05, gauge=gauge, noise=1e-3, before=0.3), seed)
+    made = rig.impact(rig.Impact(delay_sd=0.05, gauge=gauge, noise=1e-3, before=0.3), 3)
     test = ff.read_test(rig.write(made if stated else replace(made, delay_sd=0.0), tmp_path))
     result = ff.fit(test, time_shift=not stated, starts=2, intervals="local")
     late = made.truth["time_shift"]
@@ -44,7 +43,7 @@ def test_noise_of_a_velocity_is_not_taken_for_noise_of_its_integral(tmp_path):
     assert np.mean(held) > 0.8
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_an_interior_zero_from_few_rows_is_uncertain(tmp_path, seed):
     """Taken as exact, it left 16 of 24 true values outside their intervals, by up to 8 errors.
 
@@ -107,7 +106,7 @@ def test_a_record_that_begins_in_the_contact_determines_nothing(tmp_path):
     assert any("starts under load" in one.why for one in found.values())
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_noisy_stress_that_drives_an_impact_keeps_its_kinks(seed):
     """A spline took them for noise: k0 was up to ten standard errors off, determined."""
     spring, test = synthetic_impact(noise=5e-3, seed=seed)

@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import EXPERIMENTS
+from conftest import EXPERIMENTS, needs_panel
 from cycled import write_record
 from serving import served
 
 api = pytest.importorskip(
     "playwright.sync_api", reason='no browser is driven without: pip install "foamfit[test]"'
 )
-pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
+pytestmark = needs_panel
 __all__ = ["served"]
 
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")

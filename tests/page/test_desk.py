@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from conftest import EXPERIMENTS, few_bytes, run, without_pictures, write_lines
+from conftest import EXPERIMENTS, few_bytes, needs_panel, run, without_pictures, write_lines
 from cycled import write_record
 from foamfit.data import rig as rig_module
 from foamfit.errors import InputError
@@ -299,8 +299,8 @@ def test_turned_curves_are_those_of_a_simulation(drive):
     assert not np.allclose(stress, before.curves["stress_strain"][1], atol=1e-2 * size)
 
 
+@needs_panel
 def test_the_notebook_shows_a_history(tmp_path):
-    pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
     from foamfit.page.curves import Curves
 
     record = ff.read_test(write_record(tmp_path), cycles=(1, 3))
@@ -311,8 +311,8 @@ def test_the_notebook_shows_a_history(tmp_path):
     assert curves.sliders.wrong
 
 
+@needs_panel
 def test_ticks_say_what_a_fit_holds_and_varies():
-    pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
     from foamfit.page.curves import Curves
 
     curves = Curves(Turning(ff.read_test(TEST), "bistable"))

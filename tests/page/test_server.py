@@ -6,10 +6,10 @@ import sys
 
 import pytest
 
-from conftest import run_refused
+from conftest import needs_panel, run_refused
 from serving import served
 
-pytest.importorskip("panel", reason='the page needs Panel: pip install "foamfit[page]"')
+pytestmark = needs_panel
 __all__ = ["served"]
 
 
