@@ -216,5 +216,7 @@ def test_a_steep_short_peak_is_no_gap() -> None:
     assert not find_outliers(force).any()
     often = np.arange(force.size) % 20 == 5
     assert np.array_equal(find_outliers(np.where(often, 9999.0, force)), often)  # for no value
+    hits = np.where(np.arange(300) % 20 < 2, 250.0, np.random.default_rng(1).normal(size=300))
+    assert not find_outliers(hits).any()  # clipped, and too short for flanks
     force[40:44] = 0.0  # a real gap in the same record
     assert np.flatnonzero(find_outliers(force)).tolist() == [40, 41, 42, 43]

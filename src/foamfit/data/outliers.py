@@ -8,6 +8,7 @@ true hold, the motion continues smoothly from its level and the stress follows.
 from __future__ import annotations
 
 from dataclasses import replace
+from statistics import mode
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,8 @@ _MOST = 0.02  # share of the samples: if more stand out, none is an outlier
 _FEWEST = 30  # samples of a record in which outliers can be found
 _WIDTH, _HALF = 9, 4  # samples of a local cubic, and on either side of its middle
 _PAUSE = 6.0  # a longer step, in usual steps, is a pause
+# Values for missing ones
+_FAR = 2.0  # least step to them, as a multiple of the largest step between other samples
 # Short gaps
 _JUMP, _NEARBY = 10.0, 31  # least jump at both ends, in median jumps of this many samples
 _MAX_RUN = 5  # longest gap, samples
@@ -61,7 +64,8 @@ def find_outliers(values: Array, time: Array | None = None) -> Mask:
     spike deviates by four standard deviations from the cubic through its eight neighbours, while
     the neighbours are consistent and the lines through either side do not lead to the spike.
     Samples at a pause are not tested, and in a held channel only gaps are found. If more than 2 %
-    of the samples stand out, none is an outlier, unless all have one value, as 9999 for no value.
+    of the samples stand out, none is an outlier, except those with one value that stands for a
+    missing one, such as 9999.
     """
     n = values.size
     if n < _FEWEST:
@@ -77,8 +81,26 @@ def find_outliers(values: Array, time: Array | None = None) -> Mask:
         if not found.any():
             break
         wrong |= found
-    few = wrong.sum() <= max(_MOST * n, 2) or np.ptp(values[wrong]) == 0.0
-    return wrong if few else np.zeros(n, dtype=bool)
+    if wrong.sum() <= max(_MOST * n, 2):
+        return wrong
+    missing = _missing(values, wrong)
+    rest = _bridged(values, missing, at)
+    return missing | find_outliers(rest, time) if missing.any() else missing
+
+
+def _missing(values: Array, wrong: Mask) -> Mask:
+    """Find the `wrong` samples whose value stands for a missing one, if there is such a value.
+
+    It is far from its neighbours, in steps that the other samples do not show; the flanks of
+    clipped peaks are such steps. Peaks too short for flanks leave only noise, whose steps scatter
+    more than its values.
+    """
+    one = values == mode(values[wrong].tolist())
+    steps, found = np.abs(np.diff(values)), one & wrong
+    others, ends = steps[~(one[1:] | one[:-1])], steps[found[1:] != found[:-1]]
+    far = np.median(ends) > _FAR * others.max(initial=0.0)
+    signal = np.mean(others**2) < np.var(values[~one])
+    return found if far and signal else np.zeros(values.size, dtype=bool)
 
 
 def _bridged(values: Array, wrong: Mask, time: Array) -> Array:
