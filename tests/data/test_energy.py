@@ -100,3 +100,4 @@ def test_cartilage_does_not_close(tmp_path, number, velocity):
     found = audit(read_test(DATA / "cartilage-impact" / f"test_{number}_impact.csv", toml))
     assert 0.745 < found.impulse_ratio < 0.795  # depends on the zero of eight rows
     assert any("impulse of the force" in warning for warning in found.warnings())
+    assert "N·s (by the velocity given)." in " ".join(found.sentences())  # the other is the ratio

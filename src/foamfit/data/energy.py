@@ -82,9 +82,12 @@ class EnergyAudit:
         if self.rebound_velocity is not None:
             results.append(f"The striker leaves at {self.rebound_velocity:.3g} m/s.")
         if self.impulse is not None and self.momentum_change is not None:
+            # The warning of a contradiction has the ratio that the motion shows.
+            how = f"ratio {self.impulse_ratio:.2f}"
+            how = "by the velocity given" if self.contradictions else how
             results.append(
                 f"The impulse of the force is {self.impulse:.4g} N·s, the striker's change of "
-                f"momentum {self.momentum_change:.4g} N·s (ratio {self.impulse_ratio:.2f})."
+                f"momentum {self.momentum_change:.4g} N·s ({how})."
             )
         if self.damping is not None:
             by = f"an onsite damper, η = {engineering(self.damping, 'Pa·s')}"
