@@ -247,6 +247,8 @@ _NAME = Rule(
 )
 _PRIOR = Rule(lambda v: isinstance(v, str), 'like "5.5 ± 0.1 MPa"')
 _SCALE = "4444.4 N/V"
+# Keys of TOML files that may lie beside a test with their name
+_OTHERS = {"tests": "a study of several tests", "chain": "a scene", "machine": "a rig"}
 # Channels of a [motion] file, in addition to displacements of interior masses.
 MOTION_CHANNELS = "time", "displacement", "strain", "velocity"
 
@@ -285,6 +287,9 @@ def read_settings(path: Path, test: Path, *, channels: Iterable[str]) -> Setting
     """
     document = load_toml(path, f"{test.name} needs a TOML with [specimen] height and diameter")
     tables = dict.fromkeys(["columns", "motion", "priors", *_SECTIONS])
+    for what in (what for key, what in _OTHERS.items() if key in document):
+        remedy = "rename one of them, or give the other TOML by --specimen"
+        raise InputError(f"{path}: is {what}, not the TOML of {test.name}; {remedy}.")
     check_keys(f"{path}:", document, ["name", *tables])
     with naming(path):
         values, spreads = _split(checked_tables(document, _SECTIONS))
