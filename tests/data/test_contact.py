@@ -236,6 +236,9 @@ def test_a_motion_counts_before_contact_only_in_flight():
     assert flight.time[0] == pytest.approx(-0.1 * DURATION, rel=0.1)
     assert flight.sampled == {}
     assert "displacement" not in flight.zeros
+    late = record()  # the striker comes into the range of its gauge
+    late = run(replace(late, displacement=np.maximum(late.displacement, -0.0015)))
+    assert late.displacement.max() == pytest.approx(flight.displacement.max(), rel=1e-3)
     marked = rest.sampled["displacement"]
     assert not marked[rest.time < 0].any()
     assert not marked[(rest.time > 0) & (rest.time < 1.9 * DURATION / 500)].any()

@@ -53,7 +53,8 @@ class Start:
     `error` is the standard error of that time; `how` describes in words how it was found, and `by`
     is the channel: "stress", "motion", or "file" if nothing was recorded before contact. If `free`,
     the specimen was unloaded before. `gauge` is the motion before contact: "rest", "flight" (at the
-    initial velocity of contact), "other", or "" if not recorded.
+    initial velocity of contact), "other", or "" if not recorded; the striker comes into its range
+    at the sample `seen`.
     """
 
     how: str
@@ -63,6 +64,7 @@ class Start:
     by: str = "file"
     free: bool = False
     gauge: str = ""
+    seen: int = 0
 
     @property
     def resting(self) -> int:
@@ -237,6 +239,8 @@ def start_of_impact(record: Record, levels: Levels, *, late: bool = False) -> St
         alike = abs(at[0] - start.time) < 0.1 * (time[up][-1] - start.time)
         if not start.free or (at[1] < start.error and alike):
             start = _at_kink("displacement", time, at, "motion")
+        elif not alike and at[0] < start.time:
+            start = replace(start, seen=int(np.searchsorted(time, at[0])))
     elif "stress" in record.derived and flies:  # the motion was recorded in flight
         below = np.flatnonzero(stress[: int(np.argmax(stress))] < _BRAKED * stress.max())
         last = int(below[-1]) if below.size else 0

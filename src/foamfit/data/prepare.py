@@ -154,7 +154,11 @@ def _contact_of_impact(
         record, start = straight, contact.start_of_impact(straight, levels, late=late)
     if record.stress[start.first :].max() == 0.0:
         raise _never_positive(record.stress)
-    start = replace(start, gauge=zeros.gauge_before(record, start, levels, striker))
+    gauge = zeros.gauge_before(record, start, levels, striker)
+    if gauge != "flight":  # the motion did not come into the range of the gauge
+        start = replace(start, seen=0)
+        gauge = zeros.gauge_before(record, start, levels, striker)
+    start = replace(start, gauge=gauge)
     return record, start, zeros.span_of_impact(record, start, levels)
 
 

@@ -233,16 +233,16 @@ def _zero_of_motion(
 
 def gauge_before(record: Record, start: Start, levels: Levels, striker: Striker) -> str:
     """Classify the motion of an impact before contact; see `Start.gauge`."""
-    time, w, before = record.instants, record.displacement, start.first - 2
+    time, w, before = record.instants, record.displacement, slice(start.seen, start.first - 2)
     if w is None or not start.free or start.first == 0:
         return ""
-    if before < 3:
+    if before.stop - before.start < 3:
         return "other"
     top = int(np.argmax(w))
     early = slice(start.first, start.first + max(5, (top - start.first) // 6))
     slope, after = (
         polynomial_at(time[rows], w[rows], start.time, levels["displacement"])[1]
-        for rows in (slice(before), early)
+        for rows in (before, early)
     )
     speed = striker.velocity or after.value
     # The stated velocity may be wrong, but the striker does not change its speed at contact.
@@ -282,11 +282,12 @@ def flight_of(
     Return the striker, with gravity from its flight if the TOML does not give it, its velocity in
     flight with its standard error, m/s, or None, and notes.
     """
-    n, w, given, notes = start.first - 2, record.displacement, striker.velocity, list[str]()
-    if not given or w is None or n < 8:
+    given, notes, before = striker.velocity, list[str](), slice(start.seen, start.first - 2)
+    if not given or record.displacement is None or before.stop - before.start < 8:
         return striker, None, notes
-    noise, t = levels["displacement"], record.instants[:n] - start.time
-    gravity, error = (2.0 * half for half in polynomial_at(t, w[:n], 0.0, noise, 2)[2][:2])
+    w, t = record.displacement[before], record.instants[before] - start.time
+    noise = levels["displacement"]
+    gravity, error = (2.0 * half for half in polynomial_at(t, w, 0.0, noise, 2)[2][:2])
     none = start.gauge == "flight" and 4.0 * error < GRAVITY
     if falls := gravity > 4.0 * error and abs(gravity - GRAVITY) < 0.2 * GRAVITY + 2.0 * error:
         gain = percent(GRAVITY * float(record.instants[span.end - 1] - start.time) / given)
@@ -300,7 +301,7 @@ def flight_of(
     if striker.gravity is None and (falls or none):
         striker = replace(striker, gravity=GRAVITY if falls else 0.0)
     fall = 0.5 * (striker.gravity or 0.0) * t**2
-    speed, error = polynomial_at(t, w[:n] - fall, 0.0, noise)[1][:2]
+    speed, error = polynomial_at(t, w - fall, 0.0, noise)[1][:2]
     if striker.gravity is None:  # the line has the mean velocity of a fall
         error = float(np.hypot(error, 0.5 * GRAVITY * np.ptp(t)))
     flight = (speed, error) if speed > 0.5 * given else None
