@@ -59,14 +59,15 @@ def test_bluehill_universal(tmp_path):
     assert any("displacement 'Displacement (mm)' is left out; it differs" in n for n in test.notes)
 
 
-@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-16"])
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-16", "mac_roman"])
 @pytest.mark.parametrize(
     ("header", "units", "columns"),
     [
         ("Prüfzeit;Standardkraft;Standardweg", "s;N;mm", (TIME, FORCE, MOTION)),
-        ("Prüfzeit;Druckspannung;Stauchung", "s;N/mm²;%", (TIME, FORCE / 100, 10 * MOTION)),
+        ("Prüfzeit;Druckspannung;Stauchung", "s;N/mm^2;%", (TIME, FORCE / 100, 10 * MOTION)),
         ("Prüfzeit;Druckspannung;Stauchung", "s;MPa;mm", (TIME, FORCE / 100, MOTION)),
         ("Zeit in s;Kraft in N;Weg in mm", None, (TIME, FORCE, MOTION)),
+        ("Prüfzeit, s;Prüfkraft, N;Weg, mm", None, (TIME, FORCE, MOTION)),
     ],
 )
 def test_a_german_testing_machine(tmp_path, encoding, header, units, columns):
@@ -107,11 +108,14 @@ def test_columns_may_be_separated_by_blanks(tmp_path, head, decimal):
         ("Time", "", ",", "."),
         ("Time (hh:mm:ss)", "2026-05-03 ", "\t", "."),
         ("Zeit", "3/5/2026 ", ";", ","),
+        ("Time", "03-May-2026 ", ",", "."),
+        ("Elapsed time (mm:ss.0)", None, "\t", "."),  # past the hour
     ],
 )
 def test_a_time_of_day(tmp_path, head, day, sep, decimal):
     of_day = [
-        f"{day}{t // 3600:.0f}:{t // 60 % 60:02.0f}:{t % 60:07.4f}".replace(".", decimal)
+        (f"{day}{t // 3600:.0f}:" if day is not None else "")
+        + f"{t // 60 % 60:02.0f}:{t % 60:07.4f}".replace(".", decimal)
         for t in 9 * 3600 + 59 * 60 + 41 + TIME
     ]
     others = rows(FORCE, MOTION, sep=sep, decimal=decimal)
@@ -119,7 +123,7 @@ def test_a_time_of_day(tmp_path, head, day, sep, decimal):
     path = write(tmp_path, [sep.join([head, "force (N)", "displacement (mm)"]), *body])
     expect(read_test(path))
     path.write_text(path.read_text().replace(f":41{decimal}1875", ":61"))
-    refused(path, "row 3", "9:59:61'; it must be a number")
+    refused(path, "row 3", "59:61'; it must be a number or a time like 0:01:30")
 
 
 def test_a_time_of_day_in_twelve_hours_past_midnight(tmp_path):
@@ -195,14 +199,19 @@ def test_without_headers_columns_have_numbers(tmp_path, sep):
 
 @pytest.mark.parametrize(
     ("names", "encoding"),
-    [("Aika [s],Voima [N],Siirtymä [mm]", "utf-8"), ("時間 [s],荷重 [N],変位 [mm]", "cp932")],
+    [
+        ("Aika [s],Voima [N],Siirtymä [mm]", "utf-8"),
+        ("時間 [s],荷重 [N],変位 [mm]", "cp932"),
+        ("Âðåìÿ [s],Ñèëà [N],Õîä [mm]", "latin-1"),  # of Время, Сила, Ход in cp1251
+    ],
 )
 def test_a_header_not_understood_is_quoted_with_the_lines_that_help(tmp_path, names, encoding):
     lines, quoted = [names, *rows(TIME, FORCE, MOTION)], [f'"{n}"' for n in names.split(",")]
     channels = zip(("time", "force", "displacement"), quoted, strict=True)
     helping = [f"{channel} = {{ column = {name} }}" for channel, name in channels]
     there = "there are " + ", ".join(quoted[:2]).replace('"', "'")
-    refused(write(tmp_path, lines, encoding=encoding), there, *helping)
+    said = refused(write(tmp_path, lines, encoding=encoding), there, *helping)
+    assert ("save the file as UTF-8" in said) == (encoding != "utf-8")
     expect(read_test(write(tmp_path, lines, COLUMNS + "\n".join(helping), encoding=encoding)))
     lines[0] = "Aika,Voima,Siirtymä"
     refused(write(tmp_path, lines), "'Voima'", 'force = { column = "…", unit = "N" }')
@@ -368,6 +377,8 @@ def test_a_workbook(tmp_path):
     test = read_test(workbook(tmp_path, {"Ergebnisse": [["Probe", "Fmax"], [1, 200]], "1": CELLS}))
     expect(test)
     assert test.rows.rows == N
+    texts = [[str(cell or "").replace(".", ",") for cell in row] for row in CELLS]
+    expect(read_test(workbook(tmp_path, {"1": texts})))
     two = {"Probe 1": CELLS, "Probe 2": [*HEAD, *([a, b / 2, c] for a, b, c in CELLS[4:])]}
     refused(workbook(tmp_path, two), "2 sheets", "'Probe 2'", '[data] sheet = "Probe 1"')
     chosen = SPECIMEN + '[data]\nsheet = "Probe 2"\n'
@@ -531,3 +542,5 @@ def test_a_striker_without_a_time_is_warned_of(tmp_path):
     untimed = [line.partition(",")[2] for line in PLAIN]
     expect(test := read_test(write(tmp_path, untimed, SPECIMEN + STRIKER)), None)
     assert any("there is a [striker] but no time column" in n for n in asked(test))
+    expect(test := read_test(write(tmp_path, ["Dauer" + PLAIN[0][4:], *PLAIN[1:]])), None)
+    assert 'like time = { column = "Dauer (s)" }' in asked(test)[0]

@@ -34,7 +34,7 @@ from foamfit.data.tables.channels import (
     read_channels,
     turn_negative,
 )
-from foamfit.data.tables.columns import TWINS, Source, si_factor
+from foamfit.data.tables.columns import TWINS, Source, entries_of, si_factor
 from foamfit.data.tables.csv_table import read_numbers, read_text
 from foamfit.data.tables.draft import without_toml
 from foamfit.data.tables.headers import CHANNELS, example
@@ -181,10 +181,13 @@ def _record(channels: Channels, settings: Settings) -> Record:
     numbers, notes = channels.engineering(), channels.notes
     notes += _compare(channels.source, numbers, settings)
     specimen, striker = settings.specimen, settings.striker or Striker()
-    if settings.striker is not None and "time" not in numbers:
+    if "time" not in numbers:
         slow = "this is treated as a slow test and the striker is not used"
         said = f"there is a [striker] but no time column, so {slow}"
-        notes.append(f"Check: {said}; name the time in [columns].")
+        said = said if settings.striker is not None else "no column is named as the time"
+        entry = entries_of(channels.source.table, set(), "time")
+        if settings.striker is not None or "…" not in entry:
+            notes.append(f"Check: {said}; name the time in [columns], like {entry}.")
     stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
     displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
     acceleration = numbers.get("acceleration")

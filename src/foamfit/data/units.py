@@ -35,7 +35,8 @@ def _registry() -> Any:
 def _unit(text: str) -> Any:
     """Return the unit as a pint quantity of magnitude 1, or None if pint does not know it."""
     text = text.strip().replace("·", "*").replace("^", "**")
-    if re.search(r"\d\d|\d\W+\d|\de[+-]?\d", text):  # "seed 2014", "x10 N", "1e3 N", "9**9**9"
+    # "seed 2014", "x10 N", "1e3 N", "9**9**9", and a µm that lost its µ, which pint would read as m
+    if re.search(r"\d\d|\d\W+\d|\de[+-]?\d|[?¿\ufffd]", text):
         return None
     text = re.sub(r"(?<=[A-Za-z])(-?\d)", r"**\1", text)  # m/s2
     if text in {"-", "–", "1"}:

@@ -264,8 +264,8 @@ def column_of(table: Table, k: int) -> str | int:
 def si_factor(table: Table, channel: str, k: int, given: Entry | None) -> float:
     """Return the factor from the numbers of column `k` to SI."""
     header, given = table.headers[k], given or Entry(channel)
-    # A count (pint would read "Cycles" in a header as a unit of angle), or a time of day, s.
-    if channel == "cycle" or (channel == "time" and table.is_of_day(k)):
+    # A count (pint would read "Cycles" in a header as a unit of angle), or times of a clock, s.
+    if channel == "cycle" or (channel == "time" and table.period(k)):
         return 1.0
     right, where = example(channel), f"column {table.name(k)}"
     if header.measure(channel) and channel == "stress":

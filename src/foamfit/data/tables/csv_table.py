@@ -38,12 +38,13 @@ _STATISTICS = re.compile(
 _STATISTICS_ROWS, _FOOT = 12, 24  # most of these, and rows among which they are sought
 # What programs write for a missing number
 _MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "none"}
-# A time of day such as 12:00:00.5 or 3:00:00.5 PM, with or without a date before it.
-_OF_DAY = re.compile(
-    r"(?:[\d./-]+[T ]+)?(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,]\d+)?)(?: ?([ap])m|Z)?",
+# A time such as 12:00:00.5 or 3:00:00.5 PM, with or without a date before it, or in minutes and
+# seconds like 59:30.5, as spreadsheets show a time with fractions of a second.
+_CLOCK = re.compile(
+    r"(?:(?:[\w./-]*\d[T ]+)?(\d{1,3}):)?((?(1)[0-5]\d|\d{1,3})):"
+    r"([0-5]\d(?(1)(?:[.,]\d+)?|[.,]\d+))(?: ?([ap])m|Z|[+-]\d\d:?\d\d)?",
     re.IGNORECASE | re.ASCII,
 )
-DAY = 86400.0  # s
 # First bytes of UTF-16, with and without a byte order mark.
 _WIDE = {b"\xff\xfe|\xfe\xff": "utf-16", b".\0": "utf-16-le", b"\0.": "utf-16-be"}
 _ONE = "a file must contain one table with one header"
@@ -52,11 +53,12 @@ _NO_THOUSANDS = "write the numbers with a decimal point and without separators"
 
 @dataclass(frozen=True)
 class Text:
-    """Text of a file, and the digest of its bytes."""
+    """Text of a file, the digest of its bytes, and whether its encoding was guessed."""
 
     path: Path
     content: str
     sha256: str
+    guessed: bool
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,9 @@ class Table(Text):
 
     @property
     def listed(self) -> str:
-        """Quoted headers, separated by commas."""
-        return ", ".join(repr(h.text) for h in self.headers if h.text)
+        """Quoted headers, separated by commas, and a hint if they may be garbled."""
+        garbled = " – if letters look wrong, save the file as UTF-8" * self.guessed
+        return ", ".join(repr(h.text) for h in self.headers if h.text) + garbled
 
     def name(self, column: int) -> str:
         """Return a quoted header, with its number if it is not unique."""
@@ -87,10 +90,10 @@ class Table(Text):
         unique = sum(header.text == text for header in self.headers) == 1
         return repr(text) if unique else f"{text!r} (number {column + 1})"
 
-    def is_of_day(self, column: int) -> bool:
-        """Return whether the first cell of a column is a time of day."""
+    def period(self, column: int) -> float:
+        """Return the time (s) after which a clock like 59:30.5 begins anew; 0 without colons."""
         first = next((cells[column] for _, cells in self.rows() if len(cells) > column), "")
-        return _OF_DAY.fullmatch(first.strip()) is not None
+        return (0.0, 3600.0, 86400.0)[min(first.count(":"), 2)]
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield (row number in the file, cells) of the lines that are not blank."""
@@ -106,7 +109,7 @@ class Table(Text):
 def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
     """Read a file or a `sheet` of a workbook as text; `wanted` describes it for messages."""
     raw = read_bytes(path, f"give {wanted}")
-    sha256 = hashlib.sha256(raw).hexdigest()
+    sha256, guessed = hashlib.sha256(raw).hexdigest(), False
     with naming(path):
         raw = unpacked(raw, sheet)
         if not raw.strip():
@@ -115,22 +118,27 @@ def read_text(path: Path, wanted: str, sheet: str | None = None) -> Text:
             wide = next((w for start, w in _WIDE.items() if re.match(start, raw, re.DOTALL)), "")
             text = raw[: len(raw) // 2 * 2].decode(wide) if wide else raw.decode("utf-8-sig")
         except UnicodeDecodeError:
-            text = _of_code_page(raw.removeprefix(codecs.BOM_UTF8))
+            text, guessed = _of_code_page(raw.removeprefix(codecs.BOM_UTF8)), True
         text = text.lstrip("\ufeff")  # a converted file may have several byte order marks
         text = re.sub(r"\u2212(?=[\d.,])", "-", text) if "\u2212" in text else text
         if "\0" in text:
             raise InputError("is a binary file; it must be a text table (CSV) or .xlsx.")
-    return Text(path, re.sub(r"\r*\n|\r", "\n", text) if "\r" in text else text, sha256)
+    content = re.sub(r"\r*\n|\r", "\n", text) if "\r" in text else text
+    return Text(path, content, sha256, guessed)
 
 
 def _of_code_page(raw: bytes) -> str:
-    """Decode Latin-1, or Shift-JIS or Windows-1252 if Latin-1 has control characters instead."""
+    """Decode Latin-1; if that has control characters, Shift-JIS, Windows-1252 or Mac Roman."""
     text = raw.decode("latin-1")
     if not re.search(r"[\x80-\x9f]", text):
         return text
     japanese = raw.decode("cp932", "replace")
     words = "\ufffd" not in japanese and re.search(r"[\u3040-\u30ff\u4e00-\u9fff]{2}", japanese)
-    return japanese if words else raw.decode("cp1252", "replace")
+    if words:
+        return japanese
+    windows = raw.decode("cp1252", "replace")
+    # The ä and ü of a Macintosh would be capitals within a word: "PrŸfzeit".
+    return raw.decode("mac_roman") if re.search("[a-z][ŠŸ]", windows) else windows
 
 
 def find_table(text: Text, names: set[str | int]) -> Table:
@@ -139,7 +147,7 @@ def find_table(text: Text, names: set[str | int]) -> Table:
     head = [line.rstrip("\n") + "\n" for line, _ in zip(lines, range(_HEAD_ROWS), strict=False)]
     read = {s: list(_cells(head, s)) for s in _SEPARATORS}
     grids = {s: [[" ".join(c.split()) for c in row] for _, row in rows] for s, rows in read.items()}
-    whole = text.path, text.content, text.sha256
+    whole = text.path, text.content, text.sha256, text.guessed
     if scope := scope_of(grids[","]):
         named, first, clock = scope
         row, cells = (1, tuple(grids[","][0])) if first else (0, ())
@@ -195,7 +203,8 @@ def _header_row(grids: dict[str, list[list[str]]], names: set[str]) -> tuple[str
             # On a tie the last row wins, as titles and instrument settings precede the header.
             # Below rows of numbers it would be a second header, which `read_numbers` rejects.
             score = _score(cells, names)
-            if score > best or (score and score == best and not numbers):
+            tie = found is not None and found[0] == separator and score == best
+            if score > best or (tie and not numbers):
                 best, found, numbers = score, (separator, i), False
             numbers = numbers or _holds_numbers(cells)
     return found
@@ -237,7 +246,7 @@ def _score(cells: list[str], names: set[str]) -> int:
 
 def _is_number(cell: str) -> bool:
     cell = cell.strip()
-    return bool(_NUMBER.fullmatch(cell.replace(",", ".")) or _OF_DAY.fullmatch(cell))
+    return bool(_NUMBER.fullmatch(cell.replace(",", ".")) or _CLOCK.fullmatch(cell))
 
 
 def _holds_numbers(cells: list[str]) -> bool:
@@ -311,7 +320,8 @@ def read_numbers(
 ) -> tuple[dict[str, Array], Integers, list[Dropped]]:
     """Read columns without conversion; return the numbers, their rows, and the dropped rows.
 
-    Times of day are converted to seconds. InputError names the first cell that is not a number.
+    Times like 12:00:00.5 are converted to seconds. InputError names the first cell that is not a
+    number.
     """
     places, dropped = list(columns.values()), list[Dropped]()
     read = _plain_numbers(table, places)
@@ -323,9 +333,9 @@ def read_numbers(
         _refuse_thousands(table, k, values)
         if table.clock is not None and k == 0:
             values[:] = table.clock[0] + table.clock[1] * values
-    if "time" in columns and table.is_of_day(columns["time"]):  # past midnight
+    if "time" in columns and (period := table.period(columns["time"])):  # past midnight
         time = read[[*columns].index("time")]
-        time[:] = np.unwrap(time, period=DAY)
+        time[:] = np.unwrap(time, period=period)
     return dict(zip(columns, read, strict=True)), rows, dropped
 
 
@@ -382,9 +392,9 @@ def _checked_numbers(
                 )
             empty.append(row)
             continue
-        of_day = _OF_DAY.fullmatch(cells[columns["time"]]) if "time" in columns else None
-        if of_day is not None:
-            total = repr(_since_midnight(*of_day.groups()))
+        clock = _CLOCK.fullmatch(cells[columns["time"]]) if "time" in columns else None
+        if clock is not None:
+            total = repr(_seconds(*clock.groups()))
             cells[columns["time"]] = total.replace(".", table.decimal)
         wrongs = ((table.headers[k].text, _wrong(cells[k], table.decimal)) for k in places)
         if bad := next((f"{name!r} is {wrong}" for name, wrong in wrongs if wrong), None):
@@ -405,9 +415,9 @@ def _checked_numbers(
     return read, np.array(rows), [Dropped.of(np.array(n), why) for why, n in dropped.items() if n]
 
 
-def _since_midnight(hours: str, minutes: str, seconds: str, half: str | None) -> float:
-    """Return a time of day in s; `half` is "a" or "p" on a clock of twelve hours."""
-    hour = float(hours) if half is None else float(hours) % 12.0 + 12.0 * (half in "pP")
+def _seconds(hours: str | None, minutes: str, seconds: str, half: str | None) -> float:
+    """Return the time of a clock in s; `half` is "a" or "p" on one of twelve hours."""
+    hour = float(hours or 0) if half is None else float(hours or 0) % 12.0 + 12.0 * (half in "pP")
     return 3600.0 * hour + 60.0 * float(minutes) + float(seconds.replace(",", "."))
 
 
@@ -474,6 +484,7 @@ def _wrong(cell: str, decimal: str) -> str:
         groups = ". " if decimal == "," else ","
         plain = re.sub(rf"(?<=\d)[_' {groups}\u2009\u202f](?=\d{{3}})", "", cell)
         hint = f" without separators, {plain}" if plain != cell and _is_number(plain) else ""
+        hint += " or a time like 0:01:30.5" * (":" in cell)
         shown = repr(cell if len(cell) <= LONGEST else cell[:LONGEST] + " …")
         return f"{shown}; it must be a number{hint}"
     return "" if math.isfinite(float(text)) else f"{cell!r}; it must be a finite number"

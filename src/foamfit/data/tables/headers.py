@@ -123,6 +123,7 @@ def parse_header(text: str) -> Header:
         return Header(text)
     bracket = re.fullmatch(r"(.*)[(\[{]([^()\[\]{}]*)[)\]}]", text)
     bracket = bracket or re.fullmatch(r"(.+) (?:/|in) (\S+)", text)
+    bracket = bracket or re.fullmatch(r"(.+?)\.\.(\S+)\.", text)  # Time..s., as R writes it
     if bracket:
         name, unit = bracket[1], bracket[2].strip()
         words = _words(f"{name} ({unit})")
@@ -161,7 +162,7 @@ def _words(name: str) -> tuple[str, ...]:
 
 
 def _split(name: str) -> list[str]:
-    return [word for word in re.split(r"[\s_:;.,()\[\]{}\-–]+", name.lower()) if word]
+    return [word for word in re.split(r"[\s_:;.,#()\[\]{}\-–]+", name.lower()) if word]
 
 
 def channel_of(name: str) -> Channel:

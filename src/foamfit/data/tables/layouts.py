@@ -65,16 +65,17 @@ def _sheet(raw: bytes, sheet: str | None) -> bytes:
         wrong = 'reading .xlsx needs openpyxl, which is not installed: pip install "foamfit[excel]"'
         raise InputError(wrong) from None
     except Exception as error:  # pandas raises many kinds for a ZIP that is not a workbook
-        raise InputError(f"is not a readable Excel workbook ({error}).") from None
-    tables = [
+        wrong = f"is not a readable Excel workbook ({error}); if it is a ZIP file, unpack it"
+        raise InputError(f"{wrong}.") from None
+    of_numbers = [
         str(name)
         for name, frame in sheets.items()
         if (frame.apply(pd.to_numeric, errors="coerce").notna().sum(axis=1) > 1).sum() >= MIN_ROWS
     ]
+    tables = of_numbers or [*map(str, sheets)]  # numbers with decimal commas may be texts
     if sheet is None and len(tables) != 1:
-        found = f"{len(tables)} sheets of numbers, {listed(map(repr, tables))}" if tables else ""
-        entry = f'[data] sheet = "{next(iter(tables or map(str, sheets)))}"'
-        raise InputError(f"has {found or 'no sheet of numbers'}; choose one by {entry}.")
+        found = f"{len(tables)} sheets, {listed(map(repr, tables))}"
+        raise InputError(f'has {found}; choose one by [data] sheet = "{tables[0]}".')
     name = tables[0] if sheet is None else sheet
     if name not in sheets:
         present = listed(repr(str(sheet_name)) for sheet_name in sheets)
