@@ -17,6 +17,7 @@ from foamfit.study.study_file import find_tests
 LAST = 4e-3  # s
 MOTION = '[motion]\nfile = "camera.csv"\n'
 COLUMNS = MOTION + "[motion.columns]\n"
+GREEN, APART = "the Green–Lagrange strain reaches 0.6", "does not overlap in time"
 
 
 def clock(rate):
@@ -26,6 +27,9 @@ def clock(rate):
 def press(t):
     """Return a displacement (m) with a peak of 4 mm."""
     return 4e-3 * np.sin(np.pi * t / LAST)
+
+
+TIMED, MOVED = {"time (s)": np.copy}, {"displacement (mm)": press}
 
 
 def table(path, **columns):
@@ -188,7 +192,7 @@ def test_a_motion_is_no_test_of_its_own(tmp_path):
         (MOTION + 'delay = "0 ± -5 us"\n', ["[motion] delay", "must not be negative"]),
         (MOTION + 'delay = "0 us ± 5 %"\n', ["[motion] delay", "less than the value"]),
         (MOTION + 'delay = "0 us ± 5 um"\n', ["[motion] delay", "± has the wrong dimension"]),
-        (MOTION + 'delay = "5 ms"\n', ["does not overlap in time", "0 s to 4 ms", "5 ms to 9 ms"]),
+        (MOTION + 'delay = "5 ms"\n', [APART, "0 s to 4 ms", "5 ms to 9 ms"]),
         (MOTION + 'delay = "0 ± 5 ms"\n', ["[motion] ± of delay = 5 ms is longer"]),
         (
             MOTION + 'delay = "3.95 ms"\n',
@@ -211,24 +215,15 @@ def test_a_wrong_motion_is_refused(tmp_path, toml, words):
 @pytest.mark.parametrize(
     ("motion", "words"),
     [
-        ({"displacement (mm)": press}, ["camera.csv: no column is a time", "[motion.columns]"]),
+        (MOVED, ["camera.csv: no column is a time", "[motion.columns]"]),
+        (TIMED | {"x": press}, ["camera.csv: no column is a displacement or a strain"]),
         (
-            {"time (s)": np.copy, "x": press},
-            ["camera.csv: no column is a displacement or a strain"],
-        ),
-        (
-            {"time (s)": np.copy, "displacement": press},
+            TIMED | {"displacement": press},
             ["'displacement' has no unit", "in [motion.columns] like displacement"],
         ),
-        ({"time (s)": np.negative, "displacement (mm)": press}, ["camera.csv: row 3", "goes back"]),
-        (
-            {"time (s)": np.copy, "green strain (%)": lambda t: 1.5e4 * press(t)},
-            ["camera.csv: the Green–Lagrange strain reaches 0.6"],
-        ),
-        (
-            {"time (s)": lambda t: t + 1.0, "displacement (mm)": press},
-            ["test.toml: [motion] camera.csv does not overlap in time"],
-        ),
+        ({"time (s)": np.negative} | MOVED, ["camera.csv: row 3", "goes back"]),
+        (TIMED | {"green strain (%)": lambda t: 1.5e4 * press(t)}, ["camera.csv: " + GREEN]),
+        ({"time (s)": lambda t: t + 1.0} | MOVED, ["test.toml: [motion] camera.csv " + APART]),
     ],
 )
 def test_a_file_of_frames_that_cannot_be_used_is_refused(tmp_path, motion, words):

@@ -113,13 +113,12 @@ def test_columns_may_be_separated_by_blanks(tmp_path, head, decimal):
     ],
 )
 def test_a_time_of_day(tmp_path, head, day, sep, decimal):
-    of_day = [
-        (f"{day}{t // 3600:.0f}:" if day is not None else "")
-        + f"{t // 60 % 60:02.0f}:{t % 60:07.4f}".replace(".", decimal)
-        for t in 9 * 3600 + 59 * 60 + 41 + TIME
-    ]
     others = rows(FORCE, MOTION, sep=sep, decimal=decimal)
-    body = [sep.join(row) for row in zip(of_day, others, strict=True)]
+    body = [
+        (f"{day}{t // 3600:.0f}:" if day is not None else "")
+        + f"{t // 60 % 60:02.0f}:{t % 60:07.4f}{sep}".replace(".", decimal) + row
+        for t, row in zip(9 * 3600 + 59 * 60 + 41 + TIME, others, strict=True)
+    ]  # fmt: skip
     path = write(tmp_path, [sep.join([head, "force (N)", "displacement (mm)"]), *body])
     expect(read_test(path))
     path.write_text(path.read_text().replace(f":41{decimal}1875", ":61"))
@@ -199,12 +198,9 @@ def test_without_headers_columns_have_numbers(tmp_path, sep):
 
 @pytest.mark.parametrize(
     ("names", "encoding"),
-    [
-        ("Aika [s],Voima [N],Siirtymä [mm]", "utf-8"),
-        ("時間 [s],荷重 [N],変位 [mm]", "cp932"),
-        ("Âðåìÿ [s],Ñèëà [N],Õîä [mm]", "latin-1"),  # of Время, Сила, Ход in cp1251
-    ],
-)
+    [("Aika [s],Voima [N],Siirtymä [mm]", "utf-8"), ("時間 [s],荷重 [N],変位 [mm]", "cp932"),
+     ("Âðåìÿ [s],Ñèëà [N],Õîä [mm]", "latin-1")],  # of Время, Сила, Ход in cp1251
+)  # fmt: skip
 def test_a_header_not_understood_is_quoted_with_the_lines_that_help(tmp_path, names, encoding):
     lines, quoted = [names, *rows(TIME, FORCE, MOTION)], [f'"{n}"' for n in names.split(",")]
     channels = zip(("time", "force", "displacement"), quoted, strict=True)
@@ -276,9 +272,8 @@ def test_an_oscilloscope(tmp_path, head, scales, form, names):
 def test_the_name_of_a_channel_is_no_unit(tmp_path, name):
     lines = [f"Time (s),{name},displacement (mm)", *rows(TIME, VOLTS, MOTION)]
     entry = f'force = {{ column = "{name}", scale = "100 N/V"'
-    refused(
-        write(tmp_path, lines, COLUMNS + entry + " }\n"), "has no unit", entry.split(",")[0], '"V"'
-    )
+    path = write(tmp_path, lines, COLUMNS + entry + " }\n")
+    refused(path, "has no unit", entry.split(",")[0], '"V"')
     expect(read_test(write(tmp_path, lines, COLUMNS + entry + ', unit = "V" }\n')))
 
 
@@ -383,9 +378,8 @@ def test_a_workbook(tmp_path):
     refused(workbook(tmp_path, two), "2 sheets", "'Probe 2'", '[data] sheet = "Probe 1"')
     chosen = SPECIMEN + '[data]\nsheet = "Probe 2"\n'
     assert read_test(workbook(tmp_path, two, chosen)).stress.max() == pytest.approx(1e6, rel=1e-5)
-    refused(
-        workbook(tmp_path, two, chosen.replace("e 2", "e 3")), "no sheet 'Probe 3'", "'Probe 1'"
-    )
+    path = workbook(tmp_path, two, chosen.replace("e 2", "e 3"))
+    refused(path, "no sheet 'Probe 3'", "'Probe 1'")
     path = write(tmp_path, PLAIN, chosen)
     refused(path, "not an Excel workbook", "leave [data] sheet out")
     (tmp_path / "test.xlsx").write_bytes(b"PK\x03\x04 no workbook")

@@ -370,20 +370,19 @@ def test_the_force_is_mass_times_acceleration_where_it_is_missing(tmp_path, colu
 
 # ------------------------------------------------------------------------------ one sentence
 
+STRESS = '[columns]\nstress = { column = "stress (MPa)", '
+
 
 @pytest.mark.parametrize(
     ("toml", "words"),
     [
         (
-            '[columns]\nstress = { column = "stress (MPa)", scale = -1 }\n',
+            STRESS + "scale = -1 }\n",
             ["stress is negative", "leave the minus sign of scale = -1 out"],
         ),
+        (STRESS + 'unit = "kPa" }\n', ["has the unit 'MPa' in its header", "says 'kPa'"]),
         (
-            '[columns]\nstress = { column = "stress (MPa)", unit = "kPa" }\n',
-            ["has the unit 'MPa' in its header", "says 'kPa'"],
-        ),
-        (
-            '[columns]\nstress = { column = "stress (MPa)", unit = "V", scale = "2 MPa/V" }\n',
+            STRESS + 'unit = "V", scale = "2 MPa/V" }\n',
             ["has the unit 'MPa' in its header", "says 'V'"],
         ),
         ('[noise]\nstress = "400 MPa"\n', ["[noise] stress = 400 MPa is 20000 %", "2 MPa"]),

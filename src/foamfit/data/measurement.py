@@ -381,11 +381,6 @@ class Measurement(Samples):
         return self.curves("acceleration")
 
 
-def is_velocity(test: Record | Measurement) -> bool:
-    """Return whether the motion is the integral of a recorded velocity."""
-    return test.motion == FROM_VELOCITY
-
-
 def is_clipped(test: Measurement) -> bool:
     """Return whether the force of a test is clipped."""
     force = test.outliers.get("stress")

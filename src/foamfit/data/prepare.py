@@ -15,6 +15,7 @@ from foamfit.data import blocks, contact, cycles, zeros
 from foamfit.data import outliers as repair
 from foamfit.data.calibration import with_gravity
 from foamfit.data.measurement import (
+    FROM_VELOCITY,
     MEASURED,
     MIN_ROWS,
     Dropped,
@@ -27,7 +28,6 @@ from foamfit.data.measurement import (
     Striker,
     Window,
     interior_channel,
-    is_velocity,
 )
 from foamfit.data.noise import (
     averaged,
@@ -110,7 +110,8 @@ def condition(
     record = blocks.thin(whole, block)
     noise = noise_before_contact(curves, start.resting, record.curves("acceleration"), block)
     noise |= {c: blocks.noise_of_blocks(lv, block, whole.sampled.get(c)) for c, lv in held.items()}
-    if is_velocity(whole) and (impact or "stress" in whole.derived):  # else it shows its noise
+    # Else the integral shows its own noise.
+    if whole.motion == FROM_VELOCITY and (impact or "stress" in whole.derived):
         velocity = whole.curves("velocity")["velocity"]
         noise["displacement"] = noise_of_integral(whole.instants, velocity)
     # The rows of a record without time are counted from the first one kept.

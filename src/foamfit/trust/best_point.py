@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 from foamfit.arrays import Array
 from foamfit.data.calibration import Contradiction, contradictions
 from foamfit.data.cycles import cycles_of
-from foamfit.data.measurement import is_velocity
+from foamfit.data.measurement import FROM_VELOCITY
 from foamfit.fitting.branches import silent, unreached
 from foamfit.fitting.nuisance import CONTACT_TIME, POSITIVE, TIME_SHIFT, open_zero
 from foamfit.fitting.objective import Simulated
@@ -127,12 +127,12 @@ class BestPoint:
 
     def judged(self, taken: Array | None = None) -> tuple[CurveError, ...]:
         """Return the `errors` if a fit of several tests has absorbed `taken` of the noise."""
-        objective = self.problem.objective
+        objective, test = self.problem.objective, self.problem.measurement
         # Noise of a driving stress that explains the residual has slow waves, as has that of a
         # velocity before its integration.
         by_stress = objective.drive == "stress" and objective.explained
         slow = set(range(len(objective.sizes))) if by_stress else set[int]()
-        if objective.drive == "impact" and is_velocity(test := self.problem.measurement):
+        if objective.drive == "impact" and test.motion == FROM_VELOCITY:
             every = "stress" in test.derived
             motion = "displacement_time"
             slow = {i for i, curve in enumerate(objective.counted) if every or curve == motion}
