@@ -27,13 +27,7 @@ from foamfit.data.measurement import (
 )
 from foamfit.data.noise import with_noise
 from foamfit.data.prepare import condition, stress_of_motion
-from foamfit.data.tables.channels import (
-    Channels,
-    check_time,
-    engineering_strain,
-    read_channels,
-    turn_negative,
-)
+from foamfit.data.tables.channels import Channels, check_time, read_channels, turn_negative
 from foamfit.data.tables.columns import TWINS, Source, entries_of, si_factor
 from foamfit.data.tables.csv_table import read_numbers, read_text
 from foamfit.data.tables.draft import without_toml
@@ -223,10 +217,9 @@ def _compare(source: Source, numbers: dict[str, Array], settings: Settings) -> l
     table, notes = source.table, list[str]()
     as_used = {"force": 1 / settings.specimen.area, "strain": settings.specimen.height}
     for channel, k in source.left_out().items():
+        alone = replace(source, columns={channel: k}, given={})
         try:
-            values = read_numbers(table, {channel: k})[0][channel]
-            values = values * si_factor(table, channel, k, None)
-            values = engineering_strain(table.headers[k].measure(channel), values)
+            values = read_channels(alone, "refuse").engineering()[channel]
         except InputError:  # not usable as an alternative
             continue
         used = TWINS.get(channel, channel)
@@ -238,7 +231,7 @@ def _compare(source: Source, numbers: dict[str, Array], settings: Settings) -> l
             other = one[0] + other * np.sign(np.dot(other, one - one[0]))
             by = percent(float(np.max(np.abs(other - one)) / np.ptp(one)))
             notes += [f"The {channel} {name} is left out; it differs by up to {by} of the range."]
-        elif np.diff(values).min() > 0 and np.ptp(values - one) > np.median(np.diff(one)):
+        elif np.ptp(values - one) > np.median(np.diff(one)):
             both = f"columns {table.name(source.columns['time'])} and {name} are times that differ"
             by = engineering(float(np.ptp(values - one)), "s")
             if settings.striker is not None:

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array, means
 from foamfit.data.measurement import MIN_ROWS, Record
-from foamfit.data.outliers import find_outliers, fresh_samples
+from foamfit.data.outliers import PAUSE, find_outliers, fresh_samples
 from foamfit.errors import InputError
 from foamfit.text import counted, engineering
-
-_PAUSE = 6.0  # a longer step, in usual steps, is a pause and is interpolated linearly
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +103,7 @@ def _through(at: Array, values: Array, time: Array) -> Array:
 
     step = np.diff(at)
     gap = np.clip(np.searchsorted(at, time, side="right") - 1, 0, step.size - 1)
-    pause = step[gap] > _PAUSE * float(np.median(step))
+    pause = step[gap] > PAUSE * float(np.median(step))
     return np.where(pause, np.interp(time, at, values), CubicSpline(at, values)(time))
 
 

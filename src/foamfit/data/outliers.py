@@ -33,7 +33,7 @@ _LEAST = 5e-3  # least residual of an outlier, as a share of the range
 _MOST = 0.02  # share of the samples: if more stand out, none is an outlier
 _FEWEST = 30  # samples of a record in which outliers can be found
 _WIDTH, _HALF = 9, 4  # samples of a local cubic, and on either side of its middle
-_PAUSE = 6.0  # a longer step, in usual steps, is a pause
+PAUSE = 6.0  # a longer step, in usual steps, is a pause
 # Values for missing ones
 _FAR = 2.0  # least step to them, as a multiple of the largest step between other samples
 # Short gaps
@@ -134,7 +134,7 @@ def _spikes(values: Array, least: float, time: Array) -> Mask:
     out, weights = np.zeros(values.size, dtype=bool), residual_filter(_WIDTH)[0]
     size = np.abs(np.convolve(values, weights, "valid")) / (own := float(weights[_HALF]))
     steps = sliding_window_view(np.diff(time), _WIDTH - 1)
-    size[steps.max(axis=1) > _PAUSE * float(np.median(steps))] = 0.0
+    size[steps.max(axis=1) > PAUSE * float(np.median(steps))] = 0.0
     most = max(least, -float(ndtri(0.5 * _RARE / values.size)) * robust_variance(size) ** 0.5)
     # A spike also increases the residuals of its neighbours: only the largest of five is one.
     largest = size >= maximum_filter1d(size, 5, mode="constant")

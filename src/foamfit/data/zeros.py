@@ -8,14 +8,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.data.contact import ELSEWHERE, Levels, Start, motion_leaves_rest, straight
-from foamfit.data.measurement import (
-    GRAVITY,
-    UNITS,
-    NoiseLevel,
-    Record,
-    Striker,
-    interior_channel,
-)
+from foamfit.data.measurement import GRAVITY, UNITS, NoiseLevel, Record, Striker, interior_channel
 from foamfit.data.noise import (
     EXACT,
     MIN_REST,

@@ -57,8 +57,9 @@ class Channels:
 
     def engineering(self) -> dict[str, Array]:
         """Convert a strain of another measure to engineering strain, with a note."""
+        table, columns = self.source.table, self.source.columns
         for channel, values in self.numbers.items():
-            if measure := self.source.measure(channel):
+            if measure := table.headers[columns[channel]].measure(channel):
                 self.numbers[channel] = engineering_strain(measure, values)
                 was = f"{measure} strain {self.source.name(channel)}"
                 self.notes.append(f"The strain is converted from the {was}.")

@@ -53,10 +53,6 @@ class Source:
         """Return the quoted header of a channel."""
         return self.table.name(self.columns[channel])
 
-    def measure(self, channel: str) -> str:
-        """Return the measure of strain or stress that a header names, "" if engineering."""
-        return self.table.headers[self.columns[channel]].measure(channel)
-
     @cached_property
     def entries(self) -> dict[str, Entry]:
         """The entries by which the channels are read: those of the TOML, completed."""
