@@ -196,20 +196,21 @@ def _first_motion(time: Array, w: Array, noise: NoiseLevel) -> tuple[float, bool
 def first_contact(record: Record) -> Record:
     """Leave out further contacts of a striker that rebounds and comes back.
 
-    The first contact has at least half of the largest stress and half of the impulse of all that
-    follow; a flight lasts longer than twice the longest contact.
+    The first contact has at least half of the largest stress and half of the impulse of any that
+    follows; a flight lasts longer than twice the longest contact.
     """
     stress, free = smooth(record.stress, 3), float(np.median(record.stress))
     share = (stress - free) / max(float(stress.max()) - free, 1e-300)
     edges = np.flatnonzero(np.diff(np.concatenate(([False], share > _AGAIN, [False]))))
     begins, ends = edges[::2], edges[1::2]
     flights = begins[1:] - ends[:-1] > 2 * (ends - begins).max()
-    for end, begin in zip(ends[:-1][flights], begins[1:][flights], strict=True):
-        before, after = (float(part.clip(0.0).sum()) for part in (share[:begin], share[begin:]))
-        if share[:end].max() >= 0.5 and before >= 0.5 * after:
+    impulses = np.add.reduceat(share.clip(0.0), begins)
+    for i in np.flatnonzero(flights):
+        before, after = impulses[: i + 1].sum(), impulses[i + 1 :].max()
+        if share[: ends[i]].max() >= 0.5 and before >= 0.5 * after:
             why = "after the first contact, as the striker comes back"
             note = "The striker comes back after its rebound; only the first contact is used."
-            return record.without(slice((end + begin) // 2, None), why).noted(note)
+            return record.without(slice((ends[i] + begins[i + 1]) // 2, None), why).noted(note)
     return record
 
 
