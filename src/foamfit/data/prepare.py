@@ -49,7 +49,6 @@ _USUAL = {
     "peak stress": (10.0, 1e9, "Pa"),
     "modulus (peak stress over peak strain)": (10.0, 1e11, "Pa"),
     "duration": (1e-6, 1e7, "s"),
-    "density": (1.0, 3000.0, "kg/m³"),
 }
 _WHOLE, _UNKNOWN = Window(), Noise()  # the whole file; no noise is stated
 
@@ -340,9 +339,7 @@ def checks(record: Record, specimen: Specimen, *, several: bool) -> Record:
     if peak <= 0.0:
         raise _never_positive(record.stress)
     duration = 1.0 if record.time is None else float(np.ptp(record.time))
-    modulus = peak / strain if strain > 0 else 1e3
-    density = specimen.mass / (specimen.area * height) if specimen.mass else 1e2
-    sizes = height, specimen.area, strain, peak, modulus, duration, density
+    sizes = height, specimen.area, strain, peak, peak / strain if strain > 0 else 1e3, duration
     for value, (name, (low, high, unit)) in zip(sizes, _USUAL.items(), strict=True):
         if not low <= value <= high:
             shown, least, most = (f"{v:.4g} {unit}".strip() for v in (value, low, high))
@@ -364,6 +361,9 @@ def checks(record: Record, specimen: Specimen, *, several: bool) -> Record:
     if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
         after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"
         notes.append(f"The stress goes down to {after}; it is kept.")
+    density = (specimen.mass or 0.0) / (specimen.area * height)
+    if specimen.mass and not 1 < density < 3000:
+        notes.append(f"Check: mass and volume give a density of {density:.3g} kg/m³.")
     return record.noted(*notes)
 
 

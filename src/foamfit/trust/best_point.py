@@ -127,13 +127,13 @@ class BestPoint:
 
     def judged(self, taken: Array | None = None) -> tuple[CurveError, ...]:
         """Return the `errors` if a fit of several tests has absorbed `taken` of the noise."""
-        objective, test = self.problem.objective, self.problem.measurement
+        objective = self.problem.objective
         # Noise of a driving stress that explains the residual has slow waves, as has that of a
         # velocity before its integration.
         by_stress = objective.drive == "stress" and objective.explained
         slow = set(range(len(objective.sizes))) if by_stress else set[int]()
-        if objective.drive == "impact" and test.motion == FROM_VELOCITY:
-            every = "stress" in test.derived
+        if objective.drive == "impact" and self.problem.measurement.motion == FROM_VELOCITY:
+            every = "stress" in self.problem.measurement.derived
             motion = "displacement_time"
             slow = {i for i, curve in enumerate(objective.counted) if every or curve == motion}
         return curve_errors(self.residual, self.scaled, objective.sizes, taken, slow)
