@@ -169,7 +169,7 @@ def unlike(tmp_path_factory):
     here, deviates = tmp_path_factory.mktemp("unlike"), np.array([-1.2, -0.6, 0.1, 0.4, 1.3])
     for i, z in enumerate(deviates):
         write_test(here, f"t{i}", seed=i, noise=0.1 * NOISE, k0=5.5e5 * (1.0 + 0.05 * z))
-    kinds = dict.fromkeys(NAMES, "shared") | {"s1_sigma_minus": "own"}
+    kinds = dict.fromkeys(NAMES, "shared") | {"s1_sigma_minus": "own", "s1_kc": "scatter"}
     study = write_study(here, "\n".join(f'{name} = "{kind}"' for name, kind in kinds.items()))
     heavy = here / "foam.toml"
     heavy.write_text(heavy.read_text().replace("[specimen]", '[specimen]\nmass = "1 kg"'))

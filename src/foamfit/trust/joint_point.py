@@ -165,7 +165,7 @@ class JointPoint:
         at, out = self.names.index(name), list[Array]()
         along = self.uncertainty.inverse[:, at]
         step = change / self._scales[at] * along / along[at]
-        for block, best in zip(self.uncertainty.blocks, self.bests, strict=True):
+        for best, block in zip(self.bests, self.uncertainty.blocks, strict=False):  # not `_drawn`
             values = best.values.copy()
             moved = values[best.places] + block.through @ step * best.sizes
             values[best.places] = np.clip(moved, *best.box)
