@@ -4,6 +4,8 @@ import math
 
 import pytest
 
+import fabricated
+from foamfit.report.readable import in_unit, readable
 from foamfit.text import (
     WIDTH,
     aligned,
@@ -15,8 +17,14 @@ from foamfit.text import (
     percent,
     signed,
     significant,
+    times,
     wrapped,
 )  # fmt: skip
+
+
+def ranged(low: float, high: float, unit: str = "Pa") -> str:
+    p = fabricated.estimate("s1_k0", high / 2.0, unit=unit, range=(low, high))
+    return readable("s1_k0", p).range
 
 
 @pytest.mark.parametrize(
@@ -25,8 +33,14 @@ from foamfit.text import (
         (engineering(3.839e6, "Pa"), "3.839 MPa"),
         (engineering(999960.0, "Pa"), "1 MPa"),
         (engineering(0.0, "m"), "0 m"),
-        (engineering(-2e-6, "m"), "-2 µm"),
+        (engineering(-2e-6, "m"), "−2 µm"),
         (engineering(1e12, "Pa"), "1000 GPa"),
+        (engineering(-410.0, "Pa", 6214.0), "−0.4 ± 6.2 kPa"),
+        (in_unit((1.7e4, 1.7e11), "Pa"), "17.00 kPa to 170.0 GPa"),
+        (ranged(1.7e4, 1.7e11), "17 kPa to 170 GPa"),
+        (ranged(0.042, 0.1, ""), "0.042 to 0.10"),
+        (ranged(8.9e-5, 230.0, "Pa s"), "0 to 230"),
+        (times(1234.5), "1,230"),
         (number(0.0123), "0.01230"),
         (number(-1.2e-7), "−1.200e−07"),
         (number(math.nan), "–"),

@@ -16,11 +16,33 @@ _NO_BREAK = "\u00a0"  # no-break space
 _PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n"}
 
 
-def engineering(value: float, unit: str) -> str:
-    """Write a value with four digits and a prefix: 3.839e6, "Pa" gives "3.839 MPa"."""
-    exponent = int(f"{value:.3e}".partition("e")[2]) if math.isfinite(value) else 0  # as rounded
+def engineering(value: float, unit: str, error: float = 0.0) -> str:
+    """Write a value with four digits and a prefix: 3.839e6, "Pa" gives "3.839 MPa".
+
+    With a standard error both are rounded to two digits of it: "3.839 ± 0.012 MPa".
+    """
+    size = max(abs(value), error)
+    exponent = int(f"{size:.3e}".partition("e")[2]) if math.isfinite(size) else 0  # as rounded
     power = min(max(3 * (exponent // 3), -9), 9)
-    return f"{value / 10.0**power:.4g} {_PREFIXES[power]}{unit}"
+    shown = f"{value / 10.0**power:.4g}".replace("-", "−")
+    if error:
+        shown = " ± ".join(with_error(value / 10.0**power, error / 10.0**power)[:2])
+    return f"{shown} {_PREFIXES[power]}{unit}"
+
+
+def with_error(value: float, stderr: float) -> tuple[str, str, int]:
+    """Return value and standard error to two digits of the error, and the number of decimals."""
+    places = 1 - math.floor(math.log10(float(f"{stderr:.1e}")))
+    most = 6 - math.floor(math.log10(abs(value))) if value else 6
+    if places > most:  # tiny error, as with synthetic data: seven digits are enough
+        return fixed(value, most), f"{stderr:.1e}", most
+    return fixed(value, places), fixed(stderr, places), places
+
+
+def fixed(value: float, places: int) -> str:
+    """Write a number with some decimals, and zero without a sign."""
+    shown = f"{round(value, places):.{max(places, 0)}f}"
+    return (shown.lstrip("-") if float(shown) == 0 else shown).replace("-", "−")
 
 
 def quantity(value: float, unit: str | None) -> str:
@@ -28,8 +50,8 @@ def quantity(value: float, unit: str | None) -> str:
     return engineering(value, unit) if unit else f"{value:.4g}"
 
 
-def number(value: float | None) -> str:
-    """Write a number with four digits and a true minus sign, an integer with all its digits.
+def number(value: float | None, digits: int = 4) -> str:
+    """Write a number with some digits, or all those of an integer, and a true minus sign.
 
     None and numbers that are not finite become "–".
     """
@@ -37,11 +59,16 @@ def number(value: float | None) -> str:
         return "–"
     if isinstance(value, int):
         return str(value)
-    shown = f"{value:.3e}"
+    shown = f"{value:.{digits - 1}e}"
     if value == 0 or 1e-3 <= abs(value) < 1e6:
-        exponent = int(shown.partition("e")[2]) if value else 3  # 999.96 is 1000, not 1000.0
-        shown = f"{value:.{max(0, 3 - exponent)}f}"
+        exponent = int(shown.partition("e")[2]) if value else digits  # 999.96 is 1000, not 1000.0
+        shown = f"{value:.{max(0, digits - 1 - exponent)}f}"
     return shown.replace("-", "−")
+
+
+def times(ratio: float) -> str:
+    """Write a ratio with three digits and no exponent: "0.770", "1,230"."""
+    return f"{Decimal(f'{ratio:#.3g}'):,f}" if math.isfinite(ratio) else str(ratio)
 
 
 def significant(value: float, digits: int = 2) -> str:

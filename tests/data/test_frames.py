@@ -71,7 +71,7 @@ def test_frames_are_put_on_the_clock_of_the_force(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("late", "told"), [(2.5e-4, "250 µs"), (-2.5e-4, "-250 µs"), (100.0, "100 s")]
+    ("late", "told"), [(2.5e-4, "250 µs"), (-2.5e-4, "−250 µs"), (100.0, "100 s")]
 )
 def test_time_of_the_force_is_that_of_the_motion_and_the_delay(tmp_path, late, told):
     at = clock(1e4)

@@ -225,7 +225,7 @@ def test_a_stress_below_zero_between_the_cycles_is_the_offset_of_the_sensor():
     later = condition(record, SPECIMEN_10, window=Window(cycle=2))
     assert first.stress.max() - later.stress.max() == pytest.approx(1e5 - 2e4 - 0.0, rel=0.3)
     assert later.stress.min() > -1.0
-    assert any("-20 kPa, is taken off as the sensor's offset" in note for note in later.notes)
+    assert any("−20 kPa, is taken off as the sensor's offset" in note for note in later.notes)
 
 
 def test_a_specimen_that_stays_under_load_between_the_cycles_is_told():

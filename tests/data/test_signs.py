@@ -112,7 +112,7 @@ def test_adhesion_at_the_end_is_kept(tmp_path: Path) -> None:
     force[-15:] = -8.0
     plain = read_test(written(tmp_path, time_s=t, force_N=force, displacement_mm=w))
     assert (plain.turned, plain.stress.min()) == ((), pytest.approx(-8e4))
-    assert any("kept" in note and "-" in note for note in plain.notes)
+    assert any("kept" in note and "−" in note for note in plain.notes)
     test = read_test(written(tmp_path, time_s=t, force_N=-force, displacement_mm=-w))
     assert test.turned == ("force", "displacement")
     same(plain, test)
@@ -226,7 +226,7 @@ def test_a_force_that_is_never_positive_is_refused(tmp_path: Path) -> None:
     t = np.linspace(0.0, 10.0, 61)
     columns = {"time_s": t, "force_N": -3.0 * t, "displacement_mm": 10 - 4 * np.sin(np.pi * t / 10)}
     path = written(tmp_path, SPECIMEN + STRIKER, **columns)
-    refused(path, "the stress is never positive in the part that is used, only -300 kPa to 0 Pa")
+    refused(path, "the stress is never positive in the part that is used, only −300 kPa to 0 Pa")
 
 
 def test_every_output_says_what_was_reversed(tmp_path: Path) -> None:

@@ -79,9 +79,9 @@ def test_every_quantity_keeps_its_own_and_check_shows_it(tmp_path):
     )  # fmt: skip
     told = " ".join(describe(test, audit(test)).split())
     for part in (
-        "height 10 mm ± 50 µm, area 19.63 ± 0.16 mm², mass 60 mg ± 1 mg",
-        "springs from the base 6 mm ± 100 µm + 4 mm",
-        "7 g ± 20 mg, 1.75 ± 0.01 m/s",
+        "height 10.000 ± 0.050 mm, area 19.63 ± 0.16 mm², mass 60.0 ± 1.0 mg",
+        "springs from the base 6.00 ± 0.10 mm + 4 mm",
+        "7.000 ± 0.020 g, 1.75 ± 0.01 m/s",
         "force from 'Load' in V times -10 N/V ± 0.5 %",
         "displacement from 'x' in mm times 1 ± 1 %",
     ):

@@ -145,9 +145,9 @@ def simulate(
 
 @main.command()
 @click.argument("test", metavar="[TEST.csv]", type=options.FILE, required=False)
-@options.option("--port", "Port of 127.0.0.1. Default: a free one.", click.IntRange(1, 65535))
+@options.option("--port", "Port of 127.0.0.1; 0: a free one.", click.IntRange(0, 65535), default=0)
 @options.option("--no-browser", "Print the address only; open no browser.")
-def page(test: Path | None, port: int | None, no_browser: bool) -> None:
+def page(test: Path | None, port: int, no_browser: bool) -> None:
     """Check, fit and explore TEST.csv in a browser.
 
     The page is served on this machine only (127.0.0.1). The first line of stdout is its address,
@@ -170,7 +170,7 @@ def page(test: Path | None, port: int | None, no_browser: bool) -> None:
         ) from None
     from foamfit.page.server import serve
 
-    serve(test, port or 0, browser=not no_browser)
+    serve(test, port, browser=not no_browser)
 
 
 def _named(*results: str | Path, **given: Any) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.measurement import GRAVITY, INTEGRATED, Entry, Measurement, is_clipped
 from foamfit.data.noise import integrated_twice, residual_time, with_noise
-from foamfit.text import engineering, percent, rounded
+from foamfit.text import engineering, percent, rounded, times
 
 # Two numbers contradict each other if they differ by more than this many standard deviations. A
 # number without a ± has one of this share, so the limit is 3 % if no ± is stated.
@@ -90,7 +90,7 @@ def contradictions(test: Measurement, shown: Balance | None = None) -> tuple[Con
         limit = max(LATE * error, float(np.median(np.diff(test.time))))
         if abs(late) > max(limit, LATE * math.hypot(error, stated)):
             says = f"the motion is {'late' if late > 0.0 else 'early'} against the force by "
-            says += f"{engineering(abs(late), 's')} ± {engineering(float(f'{error:.2g}'), 's')}"
+            says += engineering(abs(late), "s", error)
             found.append(Contradiction("time_shift", late, limit, says, ()))
     return tuple(found)
 
@@ -116,7 +116,7 @@ def _of_striker(test: Measurement, shown: Balance) -> list[Contradiction]:
     # If the motion is too fast and too long by one factor, its scale alone may be wrong.
     if len(found) == 2 and abs(found[0].ratio / found[1].ratio - 1.0) < found[1].limit:
         ratio, limit = found[1].ratio, found[1].limit
-        says = f"the motion is {ratio:#.3g} times as large as mass, velocity and force imply"
+        says = f"the motion is {times(ratio)} times as large as mass, velocity and force imply"
         entry = test.entries.get("displacement", Entry("displacement"))
         lines = ((entry.table, entry.times(1.0 / ratio, TENTH * limit)),)
         return [Contradiction("motion_scale", 1.0 / ratio, limit, says, lines)]
@@ -135,7 +135,7 @@ def _limit(test: Measurement, error: float, *quantities: str) -> float:
 def _of_force(test: Measurement, ratio: float, limit: float, mass: float) -> Contradiction:
     """Return the contradiction between mass, scale of the force and motion."""
     what = "acceleration" if test.braked else "force"
-    says = f"the impulse of the {what} is {1.0 / ratio:#.3g} of the change of momentum in the "
+    says = f"the impulse of the {what} is {times(1.0 / ratio)} of the change of momentum in the "
     says += f"motion, so {'' if test.braked else 'mass, '}scale of the {what} and motion disagree"
     entry = test.entries.get("stress", Entry(what))
     lines = [(entry.table, entry.times(ratio, TENTH * limit))]

@@ -14,7 +14,7 @@ from foamfit.arrays import Array
 from foamfit.data.calibration import Contradiction, balance, contradictions
 from foamfit.data.measurement import INTEGRATED, UNITS, Measurement, Striker
 from foamfit.data.noise import noise_level
-from foamfit.text import engineering, percent
+from foamfit.text import engineering, percent, times
 
 _OTHER_CYCLE = 0.95  # a motion falls below this share of its maximum between two cycles
 
@@ -53,10 +53,10 @@ class EnergyAudit:
         if taken is None or 0.9 <= taken <= 1.05 or self.damping is not None:  # that takes it up
             return []
         if taken > 1.05:
-            how = f"{taken:#.3g} times {brought}, which is impossible"
+            how = f"{times(taken)} times {brought}, which is impossible"
             wrong = "mass, velocity, force and motion do not agree"
         else:
-            how = f"only {taken:#.3g} of {brought}"
+            how = f"only {times(taken)} of {brought}"
             wrong = "mass, velocity, force and motion do not agree, or the record ends too early"
         return [f"Check: the foam absorbs {how}; {wrong}."]
 

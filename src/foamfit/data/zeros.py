@@ -135,8 +135,7 @@ def take_zeros(
             # The first row, which was set to zero, has an error unless the channel is exact.
             errors |= {name: noise.sigma} if noise.sigma > EXACT * size else {}
         if max(abs(zero.value), zero.error * sensor) > least * size:
-            value = engineering(zero.value, unit)
-            value += f" ± {engineering(zero.error, unit)}" if sensor else ""
+            value = engineering(zero.value, unit, zero.error if sensor else 0.0)
             record = record.noted(f"The {name} at contact, {value}, is taken off ({how}).")
         record = record.shifted(name, zero.value)
     return replace(record, zeros=errors)

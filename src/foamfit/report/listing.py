@@ -18,7 +18,7 @@ from foamfit.arrays import Array
 from foamfit.codec import build, decode, plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, write_file
-from foamfit.parts import ParameterEstimate, law_in_words
+from foamfit.parts import ParameterEstimate
 from foamfit.report import figures, tables
 from foamfit.report.figures import tail
 from foamfit.report.folder import load_result
@@ -121,8 +121,8 @@ def _listed(path: Path) -> Row:
         content = load_result(path)
         model = Model.of_result(content)
         given = content.get("options") or {"drive": content.get("drive")}
-        named = {k: v for k, v in given.items() if k not in ("model", "relaxation") and v}
-        rest = (k if v is True else f"{k} {option_value(v)}" for k, v in named.items())
+        given = {"relaxation": content.get("relaxation"), **model.options, **given, "model": None}
+        rest = (k if v is True else f"{k} {option_value(v)}" for k, v in given.items() if v)
         misfit = content.get("misfit") or _largest(content.get("tests", {}))
         every = content["parameters"].items()
         made = {n: {"vary": p.get("kind") != "fixed", **p} for n, p in every if n not in NUISANCE}
@@ -132,7 +132,7 @@ def _listed(path: Path) -> Row:
             misfit=decode(dict[str, float | None], misfit, {}),
             runtime_s=decode(float | None, content.get("runtime_s"), {}),
             parameters={name: build(ParameterEstimate, p, {}) for name, p in made.items()},
-            model=law_in_words(model.name, content.get("relaxation", 0)),
+            model=model.words,
             options=", ".join(rest),
             place=place,
             when=when,
@@ -291,13 +291,19 @@ def counts_in_words(rows: Sequence[Row]) -> str:
     return f"{total}: {listed(parts)}" if parts else "no test"
 
 
+def _of_springs(rows: Sequence[Row]) -> tables.ByTest:
+    """Return the varied parameters of the springs; a median of contact times has no meaning."""
+    every = tables.varied([row.parameters for row in rows])
+    return {name: each for name, each in every.items() if name not in NUISANCE}
+
+
 def summary_words(rows: Sequence[Row]) -> str:
     """Return the text that the command prints for a batch.
 
     Its table contains median and quartiles over the tests for each varied parameter.
     """
     wrong, parameters = [row for row in rows if not row.has_fit], list[Any]()
-    for name, each in tables.varied([row.parameters for row in rows if row.has_fit]).items():
+    for name, each in _of_springs([row for row in rows if row.has_fit]).items():
         present = [p for p in each if p is not None]
         factor, unit = tables.unit_of_all(present)
         quartiles = np.quantile([p.value / factor for p in present], [0.5, 0.25, 0.75]).tolist()
@@ -320,8 +326,7 @@ def write_comparison(
     """
     fitted = [row for row in rows if row.has_fit]
     tests = [row.test for row in fitted]
-    every = tables.varied([row.parameters for row in fitted])
-    found = {name: each for name, each in every.items() if name not in NUISANCE}
+    found = _of_springs(fitted)
     write_file(
         folder / "summary.tex", tables.by_test_tex("Test", tests, found).encode("utf-8", "replace")
     )

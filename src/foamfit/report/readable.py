@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from foamfit.parts import ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
-from foamfit.text import number
+from foamfit.text import fixed, number, with_error
 
 UNITS = {
     "Pa": ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa")),
@@ -16,7 +16,12 @@ UNITS = {
     "m": ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm")),
     "kg": ((1.0, "kg"), (1e-3, "g"), (1e-6, "mg")),
     "m/s^2": ((1e3, "km/s²"), (1.0, "m/s²")),
+    "Pa s": ((1.0, "Pa·s"),),
 }
+
+
+APART = 1e3  # ratio of two numbers from which each has a unit of its own
+NOTHING = 1e-4  # a number below this share of another is zero beside it, if units have no prefix
 
 
 def readable_unit(size: float, unit: str) -> tuple[float, str]:
@@ -55,8 +60,9 @@ class Readable:
         return f"{self.value} ± {self.stderr}" if self.stderr else self.value
 
     def with_unit(self, number: str) -> str:
-        """Append the unit, if there is one, to a number of this parameter."""
-        return f"{number} {self.unit}".removesuffix(" –") if number else ""
+        """Append the unit, if there is one, to a number of this parameter that has none."""
+        own = not number or number[-1].isalpha()
+        return number if own else f"{number} {self.unit}".removesuffix(" –")
 
     @property
     def tied(self) -> bool:
@@ -74,25 +80,33 @@ def readable(name: str, p: ParameterEstimate, given: tuple[float, str] | None = 
 
     Numbers are rounded to two digits of the standard error; without one, to four digits.
     """
-    size = p.value or p.stderr or 0.0
-    if name in NUISANCE:  # the value may be far below the error
-        size = max(abs(p.value), p.stderr or 0.0)
-    factor, unit = given or readable_unit(size, p.unit)
+    half = abs(p.ci95[1] - p.ci95[0]) / 2.0 if p.ci95 else 0.0
+    sizes = [abs(p.value), p.stderr or 0.0, half]  # the value may be far below its error
+    factor, unit = given or readable_unit(max(filter(math.isfinite, sizes), default=0.0), p.unit)
     value = p.value / factor
-    shown, stderr, interval, span = number(value), "", "", ""
+    shown, stderr, interval = number(value), "", ""
     if math.isfinite(value) and p.stderr is not None and 0 < p.stderr < math.inf:
-        shown, stderr, places = _rounded(value, p.stderr / factor)
+        shown, stderr, places = with_error(value, p.stderr / factor)
         if p.ci95 is not None:
-            interval = " to ".join(_fixed(bound / factor, places) for bound in p.ci95)
-    if p.range is not None:  # two digits suffice, of the difference in a narrow range
-        size, width = max(map(abs, p.range)), p.range[1] - p.range[0]
-        digits = 2 + (math.floor(math.log10(size / width)) if 0.0 < 10.0 * width < size else 0)
-        ends = (float(f"{bound / factor + 0.0:.{digits}g}") for bound in p.range)
-        span = " to ".join(f"{end:g}".replace("-", "−") for end in ends)
-    unit = {"": "–", "1": "–", "-": "–", "Pa s": "Pa·s", "Pa*s": "Pa·s"}.get(unit, unit)
+            interval = " to ".join(fixed(bound / factor, places) for bound in p.ci95)
+    span = "" if p.range is None else _span(p.range, p.unit, factor)
     scale = f"{p.systematic / factor:.2g}" if p.systematic else ""
     rest = (p.state, p.why, p.ci95_method or "", span, scale)
-    return Readable(name, symbol(name), shown, stderr, interval, unit, *rest)
+    return Readable(name, symbol(name), shown, stderr, interval, unit or "–", *rest)
+
+
+def _span(ends: tuple[float, float], unit: str, factor: float) -> str:
+    """Write the ends of a range with two digits, or more in a narrow one.
+
+    Both are in the unit of the `factor`, unless they lie decades apart or far above it.
+    """
+    least, most = sorted(map(abs, ends))
+    width = ends[1] - ends[0]
+    digits = 2 + (math.floor(math.log10(most / width)) if 0.0 < 10.0 * width < most else 0)
+    if _has_prefixes(unit) and (0.0 < APART * least <= most or most >= 10.0 * APART * factor):
+        return in_unit(ends, unit, digits)
+    seen = (end / factor if abs(end) > NOTHING * most else 0.0 for end in ends)
+    return " to ".join(_few(end, digits) for end in seen)
 
 
 def own_name(name: str, model: str) -> str:
@@ -100,12 +114,24 @@ def own_name(name: str, model: str) -> str:
     return name if "+" in model else name.removeprefix("s1_")
 
 
-def in_unit(values: Sequence[float], unit: str) -> str:
-    """Format one value, or the ends of an interval, in a suitable unit."""
-    if not values:
-        return ""
-    factor, name = readable_unit(max(map(abs, values)), unit)
-    return f"{' to '.join(number(value / factor) for value in values)} {name}".rstrip()
+def in_unit(values: Sequence[float], unit: str, digits: int = 4) -> str:
+    """Format one value, or the ends of an interval, in a suitable unit.
+
+    Ends that lie decades apart have a unit each: "17 kPa to 170 GPa".
+    """
+    sizes = [abs(value) for value in values if value]
+    if _has_prefixes(unit) and sizes and max(sizes) >= APART * min(sizes):
+        return " to ".join(in_unit([value], unit, digits) for value in values)
+    factor, name = readable_unit(max(sizes, default=0.0), unit)
+    return f"{' to '.join(_few(value / factor, digits) for value in values)} {name}".rstrip()
+
+
+def _has_prefixes(unit: str) -> bool:
+    return len(UNITS.get(unit, ())) > 1
+
+
+def _few(value: float, digits: int) -> str:
+    return number(float(f"{value:.{digits}g}"), digits)
 
 
 def symbol(name: str) -> tuple[str, str]:
@@ -118,17 +144,3 @@ def symbol(name: str) -> tuple[str, str]:
     stem, index = any_param(short).symbol
     term = short.removeprefix(family(short))  # number of the relaxation term
     return stem, ",".join(filter(None, (index, term, str(spring + 1))))
-
-
-def _rounded(value: float, stderr: float) -> tuple[str, str, int]:
-    """Return value and standard error to two digits of the error, and the number of decimals."""
-    places = 1 - math.floor(math.log10(float(f"{stderr:.1e}")))
-    most = 6 - math.floor(math.log10(abs(value))) if value else 6
-    if places > most:  # tiny error, as with synthetic data: seven digits are enough
-        return _fixed(value, most), f"{stderr:.1e}", most
-    return _fixed(value, places), _fixed(stderr, places), places
-
-
-def _fixed(value: float, places: int) -> str:
-    shown = f"{round(value, places):.{max(places, 0)}f}"
-    return (shown.lstrip("-") if float(shown) == 0 else shown).replace("-", "−")

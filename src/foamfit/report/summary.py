@@ -51,23 +51,26 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
         "fixed": [row for row in rows if row.state == "fixed"],
         "determined": determined(result),
         "unknown": _unknown(_of_springs(result), "report"),
+        "verbose": verbose,
         "remedies": [one.lines[0] for one in result.contradictions if one.lines],
     }
-    *lines, last = _screen(result, rows, values, verbose=verbose)
+    *lines, last = _screen(result, rows, values)
     if verbose:
         values |= {"rows": rows, "conclusions": conclusions(result), "answers": ANSWERS}
         lines.append("\n" + words("summary", **values, **tables(result)) + "\n")
     return "\n".join([*lines, last, *(line for _, line in values["remedies"])])
 
 
-def _screen(
-    result: Fit, rows: list[Readable], values: dict[str, Any], *, verbose: bool
-) -> Iterator[str]:
-    """Yield the lines that fit on one screen, or all lines with `verbose`."""
+def _screen(result: Fit, rows: list[Readable], values: dict[str, Any]) -> Iterator[str]:
+    """Yield the lines that fit on one screen, or all lines if they are to be `verbose`.
+
+    Of these, states and rows are listed further below.
+    """
+    verbose = values["verbose"]
     head = words("short", part="head", **values).split("\n")
     head = [line for one in head for line in wrapped(one, 2, COLUMNS)[:2]]
     states = [w for check in result.checklist if check.key == "determined" for w in check.warnings]
-    warnings = [one for one in result.warnings if verbose or one not in states]
+    warnings = [one for one in result.warnings if one not in states]
     varied = [row for row in rows if row.state != "fixed"]
     estimated = [row for row in varied if row.state != "not determined"]
     springs = [row for row in estimated if row.name not in NUISANCE]

@@ -110,7 +110,7 @@ def table() -> str:
     """Return the published sets and their derived points as text, in the paper's units."""
     head = ["set", "spring", "k0", "ds/s_a", "eta", "eps_a", "eps_c", "h", "kh+/k0", "kh-/k0",
             "kc/k0"]  # fmt: skip
-    sets = [head, ["", "", "MPa", "", "Pa s", "", "", "mm", "", "", ""]]
+    sets = [head, ["", "", "MPa", "", "Pa·s", "", "", "mm", "", "", ""]]
     points = ["sigma_a", "sigma_c", "eps_star", "eps_hat_a", "eps_hat_c", "sigma_hat_c"]
     derived = [["set", *points], ["", "MPa", "MPa", "", "", "", "MPa"]]
     ratios = list[str]()
