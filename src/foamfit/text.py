@@ -13,7 +13,25 @@ from decimal import Decimal
 WIDTH, NARROWEST = 100, 40
 COLUMN = 10  # column in which the text after a label begins
 _NO_BREAK = "\u00a0"  # no-break space
-_PREFIXES = {9: "G", 6: "M", 3: "k", 0: "", -3: "m", -6: "µ", -9: "n"}
+_PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "µ": 1e-6, "n": 1e-9}
+# Prefixes that are usual before a unit: no one says 7.2 ks or 593 mm/s.
+_USUAL = {"Pa": "GMk", "J/m³": "GMk", "Hz": "GMk", "N": "km", "g": "kmµ", "s": "mµn", "m": "mµn"}
+# Names of a unit for large and small numbers, with their factors, the largest first.
+UNITS = {
+    unit: sorted(((_PREFIXES[one], one + unit) for one in ("", *prefixes)), reverse=True)
+    for unit, prefixes in _USUAL.items()
+}
+UNITS["kg"] = [(1e-3 * factor, name) for factor, name in UNITS["g"]]
+UNITS |= {"Pa s": [(1.0, "Pa·s")], "m/s^2": [(1e3, "km/s²"), (1.0, "m/s²")]}
+
+
+def readable_unit(size: float, unit: str) -> tuple[float, str]:
+    """Return factor and name of a suitable unit for numbers up to `size`, which is given in `unit`.
+
+    A unit that is not in `UNITS` is kept.
+    """
+    scales, size = UNITS.get(unit, [(1.0, unit)]), abs(size) or 1.0
+    return next((scale for scale in scales if size >= scale[0]), scales[-1])
 
 
 def engineering(value: float, unit: str, error: float = 0.0) -> str:
@@ -21,13 +39,11 @@ def engineering(value: float, unit: str, error: float = 0.0) -> str:
 
     With a standard error both are rounded to two digits of it: "3.839 ± 0.012 MPa".
     """
-    size = max(abs(value), error)
-    exponent = int(f"{size:.3e}".partition("e")[2]) if math.isfinite(size) else 0  # as rounded
-    power = min(max(3 * (exponent // 3), -9), 9)
-    shown = f"{value / 10.0**power:.4g}".replace("-", "−")
+    factor, name = readable_unit(float(f"{max(abs(value), error):.3e}"), unit)
+    shown = f"{value / factor:.4g}".replace("-", "−")
     if error:
-        shown = " ± ".join(with_error(value / 10.0**power, error / 10.0**power)[:2])
-    return f"{shown} {_PREFIXES[power]}{unit}"
+        shown = " ± ".join(with_error(value / factor, error / factor)[:2])
+    return f"{shown} {name}".rstrip()
 
 
 def with_error(value: float, stderr: float) -> tuple[str, str, int]:
@@ -43,11 +59,6 @@ def fixed(value: float, places: int) -> str:
     """Write a number with some decimals, and zero without a sign."""
     shown = f"{round(value, places):.{max(places, 0)}f}"
     return (shown.lstrip("-") if float(shown) == 0 else shown).replace("-", "−")
-
-
-def quantity(value: float, unit: str | None) -> str:
-    """Write a value with four digits and its unit, if it has one."""
-    return engineering(value, unit) if unit else f"{value:.4g}"
 
 
 def number(value: float | None, digits: int = 4) -> str:

@@ -20,9 +20,9 @@ from foamfit.fitting.starts import Reading, thinned
 from foamfit.one_model import Options
 from foamfit.options import Keywords
 from foamfit.parts import law_in_words
-from foamfit.report.readable import readable_unit
 from foamfit.report.summary import CURVES
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
+from foamfit.text import readable_unit
 
 WIDE = 4.0  # upper end of a slider, as a multiple of the value
 PANELS = tuple(CURVES)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.report.figures import BLUE, GREY, INSIDE, VERMILION
-from foamfit.report.readable import readable_unit
 from foamfit.results import Fit
+from foamfit.text import readable_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

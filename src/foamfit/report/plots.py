@@ -20,8 +20,8 @@ from foamfit.errors import InputError
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, VERMILION
 from foamfit.report.panels import Line, Panel, annotate, draw, draw_below, is_known, panels_of, size
-from foamfit.report.readable import readable_unit
 from foamfit.terminal import printable
+from foamfit.text import readable_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,29 +8,10 @@ from dataclasses import dataclass
 
 from foamfit.parts import ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
-from foamfit.text import fixed, number, with_error
-
-UNITS = {
-    "Pa": ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa")),
-    "s": ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")),
-    "m": ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm")),
-    "kg": ((1.0, "kg"), (1e-3, "g"), (1e-6, "mg")),
-    "m/s^2": ((1e3, "km/s²"), (1.0, "m/s²")),
-    "Pa s": ((1.0, "Pa·s"),),
-}
-
+from foamfit.text import UNITS, fixed, number, readable_unit, with_error
 
 APART = 1e3  # ratio of two numbers from which each has a unit of its own
 NOTHING = 1e-4  # a number below this share of another is zero beside it, if units have no prefix
-
-
-def readable_unit(size: float, unit: str) -> tuple[float, str]:
-    """Return factor and name of a suitable unit for numbers up to `size`, which is given in `unit`.
-
-    A unit that is not in `UNITS` is kept.
-    """
-    scales = UNITS.get(unit, ((1.0, unit),))
-    return next((scale for scale in scales if abs(size) >= scale[0]), scales[-1])
 
 
 @dataclass(frozen=True)

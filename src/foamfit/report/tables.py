@@ -13,9 +13,10 @@ import numpy as np
 
 from foamfit.codec import plain
 from foamfit.parts import ParameterEstimate
-from foamfit.report.readable import readable, readable_unit, symbol
+from foamfit.report.readable import readable, symbol
 from foamfit.report.render import environment
 from foamfit.springs.parameters import NUISANCE, split_name, springs_first
+from foamfit.text import readable_unit
 
 if TYPE_CHECKING:
     import pandas as pd

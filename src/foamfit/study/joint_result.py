@@ -26,7 +26,7 @@ from foamfit.report import figures
 from foamfit.report.folder import Result, brief, write_json, write_result, write_text
 from foamfit.report.listing import Row, table_of
 from foamfit.report.plots import draw_loops
-from foamfit.report.readable import readable, readable_unit
+from foamfit.report.readable import readable
 from foamfit.report.render import page, sentences, words
 from foamfit.report.studies.parameters import Panel, plot_parameters
 from foamfit.report.tables import MISFITS, formula, frame, parameters_tex, stacked, symbols
@@ -35,7 +35,7 @@ from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.joint_fit import LARGEST, JointFit, parameters_of
 from foamfit.study.study_file import Study
-from foamfit.text import counted, number
+from foamfit.text import counted, number, readable_unit
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import POOR, UNACCEPTABLE, status_of, warnings_of
 from foamfit.trust.conclude import conclude, noise_of

@@ -35,7 +35,7 @@ def _environment() -> Environment:
     environment = Environment(
         loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    filters = (text.percent, text.engineering, text.listed, text.quantity)
+    filters = (text.percent, text.engineering, text.listed)
     environment.filters |= {function.__name__: function for function in filters}
     environment.filters |= {"fmt": format, "spoken": lambda name: name.replace("_", "-")}
     return environment
