@@ -28,7 +28,7 @@ from foamfit.fitting.problem import Problem, make_params
 from foamfit.fitting.search import SearchStoppedError, what_stopped
 from foamfit.one_model import Found, Options, Progress, part_of
 from foamfit.options import FREED
-from foamfit.parts import Ladder, Rung, rung_name
+from foamfit.parts import Ladder, Rung, law_in_words
 from foamfit.report import render
 from foamfit.results import Fit
 from foamfit.springs import laws
@@ -192,7 +192,7 @@ class _Comparison:
     def _skip(self, model: Model, why: str) -> bool:
         """Record the reason why a model is skipped, if there is one; return whether there is."""
         if why:
-            named = rung_name(model.name, "none", model.relaxation)
+            named = law_in_words(model.name, model.relaxation)
             self.skipped.append(f"{named}: {why}")
         return bool(why)
 
@@ -249,7 +249,7 @@ class _Comparison:
         if damping == "without":
             for name in _dampers(params):
                 params[name].set(value=0.0, vary=False)
-        named = rung_name(model.name, damping, model.relaxation)
+        named = law_in_words(model.name, model.relaxation, damping)
         start, end = (CHOSEN * (self.number - 1 + part / count) / self.of for part in (i, i + 0.8))
         tell = part_of(self.progress, start, end, f"model {self.number} of {self.of}: {named}: ")
         options = replace(self.options, max_time=left, relaxation=model.relaxation)

@@ -69,26 +69,23 @@ class ParameterEstimate:
         return replace(self, **missing)
 
 
-def rung_name(model: str, damping: str, relaxation: int = 0) -> str:
-    """Describe model, relaxation and damping in words."""
-    words, more = _in_words(model)
-    if relaxation:
-        more.append("relaxation" if relaxation == 1 else counted(relaxation, "relaxation term"))
-    if not more:
-        return words if damping == "none" else f"{words} {damping} damping"
-    more += ["damping"] * (damping == "with")
-    return f"{words} with {listed(more)}{', without damping' if damping == 'without' else ''}"
+def law_in_words(model: str, relaxation: int = 0, damping: str = "none") -> str:
+    """Describe a model, the parameters that its options free, its relaxation and damping in words.
 
-
-def _in_words(model: str) -> tuple[str, list[str]]:
-    """Return a model as `--model` takes it, and the parameters that its options free."""
+    `damping` is "with", "without" or, where it goes without saying, "none".
+    """
     from foamfit.springs.model import Model  # drawing needs no compiler
 
-    if model == "auto":
-        return model, []
-    parsed = Model.parse(model)
-    options = (name for name, is_set in parsed.options.items() if is_set)
-    return parsed.words, [parameter for name in options for parameter in FREED[name]]
+    words, more = model, list[str]()
+    if model != "auto":
+        parsed = Model.parse(model)
+        options = (name for name, is_set in parsed.options.items() if is_set)
+        words, more = parsed.words, [one for name in options for one in FREED[name]]
+    if relaxation:
+        more.append("relaxation" if relaxation == 1 else counted(relaxation, "relaxation term"))
+    more += ["damping"] * (damping == "with")
+    words += f" with {listed(more)}" if more else ""
+    return f"{words}{',' * bool(more)} without damping" if damping == "without" else words
 
 
 @dataclass(frozen=True)
@@ -124,7 +121,7 @@ class Rung:
     @property
     def name(self) -> str:
         """Model, relaxation and damping in words."""
-        return rung_name(self.model, self.damping, self.relaxation)
+        return law_in_words(self.model, self.relaxation, self.damping)
 
 
 @dataclass(frozen=True)
@@ -146,13 +143,6 @@ class Ladder:
     def chosen(self) -> Rung:
         """The model of the result."""
         return next(rung for rung in self.rungs if rung.chosen)
-
-
-def law_in_words(model: str, relaxation: int) -> str:
-    """Describe a model, the parameters that its options free, and its relaxation in words."""
-    words, more = _in_words(model)
-    more += [counted(relaxation, "relaxation term")] if relaxation else []
-    return f"{words} with {listed(more)}" if more else words
 
 
 class OfLaw:

@@ -245,7 +245,7 @@ def test_microscale_fits_stand_beside_each_other() -> None:
     labels = ["k0", "k_c", "ε_*", "σ₊", "s₊", "σ₋", "s₋", "g_1", "τ_1"]
     assert [row.label for row in pair.rows] == labels
     assert [row.percent for row in pair.rows] == [pytest.approx(10.0)] * 9
-    assert pair.side.law == "microscale with 1 relaxation term"
+    assert pair.side.law == "microscale with relaxation"
     rows = {row.label: row for row in pair.rows}
     assert (stated(rows["σ₊"]), rows["σ₊"].unit) == (pytest.approx(0.106), "MPa")
     assert (stated(rows["τ_1"]), rows["τ_1"].unit) == (0.25, "s")

@@ -33,7 +33,6 @@ from foamfit.springs.laws.record import COMMON, ETA, HEIGHT, RELAXATION_TIME, ST
 from foamfit.springs.model import Model
 from foamfit.springs.published import PublishedSet
 from foamfit.springs.published import published as published_sets
-from foamfit.text import significant
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -333,8 +332,6 @@ def _with_error(p: ParameterEstimate | None) -> str:
         return "–"
     if p.stderr is None:
         return f"{p.value:.4g}".replace("-", "−")
-    if max(abs(p.value), p.stderr) >= 1e5:
-        return f"{significant(p.value, 3)} ± {significant(p.stderr)}".replace("-", "−")
     return readable("", p, (1.0, "")).with_error
 
 

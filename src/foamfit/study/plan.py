@@ -26,7 +26,7 @@ from foamfit.fitting.minimizer import problem_of
 from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import make_params, make_problem
 from foamfit.one_model import Progress
-from foamfit.parts import rung_name
+from foamfit.parts import law_in_words
 from foamfit.report.studies.plan import Expected, Outcome, Plan, Quantity
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Chain, Impact
@@ -186,9 +186,7 @@ def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
     first = found[0].problem.model
     same = [one for one in found if one.problem.model == first]
     rest = [one for one in found if one.problem.model != first]
-    return same, {
-        rung_name(x.problem.model.name, "none", x.problem.model.relaxation): x for x in rest
-    }
+    return same, {law_in_words(x.problem.model.name, x.problem.model.relaxation): x for x in rest}
 
 
 def _published(name: str) -> Test:

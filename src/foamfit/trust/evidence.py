@@ -28,7 +28,7 @@ from foamfit.fitting import levenberg
 from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import Tracker, squares
-from foamfit.parts import rung_name
+from foamfit.parts import law_in_words
 from foamfit.results import Fit
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
@@ -142,7 +142,7 @@ class Tried:
     def __post_init__(self) -> None:
         """Compute the quantities of the comparison."""
         best, objective = self.best, self.best.problem.objective
-        self.name = rung_name(self.result.model, self.damping, self.result.relaxation)
+        self.name = law_in_words(self.result.model, self.result.relaxation, self.damping)
         self.varied = sum(item.vary for item in self.result.parameters.values())
         self.counted, self.sizes = objective.counted, objective.sizes
         self.spans = [objective.span(name) for name in self.counted]  # in units of the residual
