@@ -3,6 +3,7 @@
 import json
 import re
 import runpy
+from importlib import import_module
 
 import nbformat
 import numpy as np
@@ -41,6 +42,8 @@ def test_a_notebook_is_stored_as_notebooks_run_py_leaves_it(name):
     assert path.stat().st_size < 1_000_000
     code = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "code")
     assert all(hasattr(ff, used) for used in re.findall(r"\bff\.(\w+)", code))
+    for module, names in re.findall(r"^from (foamfit[\w.]*) import (.+)$", code, re.MULTILINE):
+        assert all(hasattr(import_module(module), one) for one in names.split(", "))
 
 
 @pytest.mark.parametrize("name", RUN)

@@ -33,6 +33,7 @@ from foamfit.springs.laws.record import COMMON, ETA, HEIGHT, RELAXATION_TIME, ST
 from foamfit.springs.model import Model
 from foamfit.springs.published import PublishedSet
 from foamfit.springs.published import published as published_sets
+from foamfit.text import significant
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -331,7 +332,7 @@ def _with_error(p: ParameterEstimate | None) -> str:
     if p is None:
         return "–"
     if p.stderr is None:
-        return f"{p.value:.4g}".replace("-", "−")
+        return significant(p.value, 4).replace("-", "−")
     return readable("", p, (1.0, "")).with_error
 
 
