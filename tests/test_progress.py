@@ -12,8 +12,7 @@ import pytest
 import foamfit as ff
 from conftest import RECONSTRUCTION, synthetic_impact, without_pictures
 from foamfit import api
-from foamfit.cli import main
-from foamfit.cli import progress as module
+from foamfit.cli import main, progress as module
 from foamfit.cli.progress import ProgressLine, progress_line
 
 pty = pytest.importorskip("pty")

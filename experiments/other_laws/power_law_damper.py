@@ -14,8 +14,7 @@ import numpy as np
 from numba import njit
 
 import foamfit as ff
-from foamfit.springs import law as formulas
-from foamfit.springs import laws
+from foamfit.springs import law as formulas, laws
 
 PAPER = laws.law("bistable")
 points_of = njit(formulas.derived_points)

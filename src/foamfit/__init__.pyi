@@ -1,55 +1,32 @@
 """Names of the package, for type checkers, editors and `__init__.py`."""
 
-from .api import FitResult as FitResult
-from .api import fit as fit
-from .cards.card import Card as Card
-from .cards.card import card as card
+from .api import FitResult as FitResult, fit as fit
+from .cards.card import Card as Card, card as card
 from .data.csv_file import read_test as read_test
 from .data.measurement import Measurement as Measurement
-from .errors import InputError as InputError
-from .errors import SimulationError as SimulationError
+from .errors import InputError as InputError, SimulationError as SimulationError
 from .fitting.problem import make_params as make_params
 from .report.studies.plan import Plan as Plan
 from .report.studies.prediction import Prediction as Prediction
-from .solve.simulation import Response as Response
-from .solve.simulation import simulate as simulate
+from .solve.simulation import Response as Response, simulate as simulate
 from .springs.chain import (
     Chain as Chain,
-)
-from .springs.chain import (
     DisplacementDrive as DisplacementDrive,
-)
-from .springs.chain import (
     Impact as Impact,
-)
-from .springs.chain import (
     StressDrive as StressDrive,
 )
 from .springs.laws import (
     BistableSpring as BistableSpring,
-)
-from .springs.laws import (
     Functions as Functions,
-)
-from .springs.laws import (
     Law as Law,
-)
-from .springs.laws import (
     LinearSpring as LinearSpring,
-)
-from .springs.laws import (
     MicroscaleSpring as MicroscaleSpring,
-)
-from .springs.laws import (
     Param as Param,
-)
-from .springs.laws import (
     register as register,
 )
 from .springs.published import published as published
 from .study.batch import batch as batch
-from .study.cycles import CycleFits as CycleFits
-from .study.cycles import fit_cycles as fit_cycles
+from .study.cycles import CycleFits as CycleFits, fit_cycles as fit_cycles
 from .study.joint import joint as joint
 from .study.joint_result import JointResult as JointResult
 from .study.plan import plan as plan

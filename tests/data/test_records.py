@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import fabricated
-from conftest import HEADER, SPECIMEN, STRIKER, refused, run
-from conftest import write_lines as write
+from conftest import HEADER, SPECIMEN, STRIKER, refused, run, write_lines as write
 from foamfit.data.calibration import contradictions
 from foamfit.data.csv_file import read_test
 from foamfit.data.energy import audit

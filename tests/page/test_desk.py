@@ -19,8 +19,7 @@ from conftest import EXPERIMENTS, few_bytes, needs_panel, run, without_pictures,
 from cycled import write_record
 from foamfit.data import rig as rig_module
 from foamfit.errors import InputError
-from foamfit.page import desk as desk_module
-from foamfit.page import worker as worker_module
+from foamfit.page import desk as desk_module, worker as worker_module
 from foamfit.page.desk import (
     Desk,
     join_toml,
@@ -34,8 +33,7 @@ from foamfit.page.desk import (
 from foamfit.page.turning import Turning
 from foamfit.page.worker import News, Worker
 from foamfit.report.folder import load_result
-from foamfit.study import cycles as cycles_report
-from foamfit.study import plan as plan_module
+from foamfit.study import cycles as cycles_report, plan as plan_module
 
 TEST = EXPERIMENTS / "foam-1" / "model-2-2.0mps-reconstruction.csv"
 GOOD = {

@@ -10,8 +10,7 @@ from test_memory import AREA, BISTABLE, LINEAR, chain, names_of, value_of, with_
 import foamfit as ff
 from foamfit.solve.plan import Motion, plan
 from foamfit.springs.chain import Drive
-from foamfit.springs.laws.record import BEGUN, HEAVIER, STRUCK
-from foamfit.springs.laws.record import MOVED as MOVED_BY
+from foamfit.springs.laws.record import BEGUN, HEAVIER, MOVED as MOVED_BY, STRUCK
 from foamfit.springs.spring import Spring
 from reference import differences
 

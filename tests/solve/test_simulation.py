@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import foamfit as ff
-from foamfit import Chain
-from foamfit import LinearSpring as Linear
+from foamfit import Chain, LinearSpring as Linear
 from foamfit.solve.plan import plan
 from independent import Truth, follow
 from reference import law

@@ -11,8 +11,7 @@ from scipy import stats
 
 import foamfit as ff
 from conftest import few_bytes, run, run_refused, without_pictures, write_csv
-from foamfit.study import joint_fit
-from foamfit.study import joint_result as joint_report
+from foamfit.study import joint_fit, joint_result as joint_report
 from foamfit.study.identified import read_source
 
 HEIGHT, TOP = 10e-3, 0.5

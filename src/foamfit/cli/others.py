@@ -211,8 +211,7 @@ def compare(
         foamfit compare fits/foam-1/model-1/impact fits/foam-1/model-1/stress
         foamfit compare fits/TEST/bistable --published foam-1/model-1 --plot comparison.png
     """
-    from foamfit.report.comparison import compare as side_by_side
-    from foamfit.report.comparison import comparison_text, plot_comparison
+    from foamfit.report.comparison import compare as side_by_side, comparison_text, plot_comparison
 
     options.check_plot(plot)
     comparison = side_by_side(results, name)

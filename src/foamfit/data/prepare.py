@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array, means
-from foamfit.data import blocks, contact, cycles, zeros
-from foamfit.data import outliers as repair
+from foamfit.data import blocks, contact, cycles, outliers as repair, zeros
 from foamfit.data.calibration import with_gravity
 from foamfit.data.measurement import (
     FROM_VELOCITY,

@@ -31,8 +31,7 @@ from foamfit.fitting.curves import (
     smooth_stress,
     without_tension,
 )
-from foamfit.solve.plan import Motion, Plan
-from foamfit.solve.plan import plan as make_plan
+from foamfit.solve.plan import Motion, Plan, plan as make_plan
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.laws.record import BEGUN, HEAVIER, MOVED, STRUCK
 from foamfit.springs.model import Model

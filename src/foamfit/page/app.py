@@ -19,8 +19,7 @@ import panel as pn
 
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError
-from foamfit.page import desk as desks
-from foamfit.page import inputs as ui
+from foamfit.page import desk as desks, inputs as ui
 from foamfit.page.curves import Curves, misfits_text
 from foamfit.page.turning import Turning
 from foamfit.page.worker import FirstUse, News, Worker, parsed

@@ -31,8 +31,7 @@ from foamfit.results import Fit
 from foamfit.springs.laws import law
 from foamfit.springs.laws.record import COMMON, ETA, HEIGHT, RELAXATION_TIME, STRENGTH, Compared
 from foamfit.springs.model import Model
-from foamfit.springs.published import PublishedSet
-from foamfit.springs.published import published as published_sets
+from foamfit.springs.published import PublishedSet, published as published_sets
 from foamfit.text import significant
 
 if TYPE_CHECKING:

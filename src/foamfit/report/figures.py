@@ -116,14 +116,14 @@ def axes_or_new(ax: Axes | None) -> Iterator[Axes]:
         yield pyplot.subplots(figsize=(4.5, 3.2), layout="constrained")[1]
 
 
-def named_in(axes: Iterable[Axes]) -> dict[str, Any]:
-    """Return the labelled artists of all axes by label, for a common legend."""
+def legend_below(figure: Figure, axes: Iterable[Axes], first: Iterable[str] = ()) -> None:
+    """Draw a common legend below all panels, which begins with the labels `first`.
+
+    Every line but the first adds to the figure's height.
+    """
     each = (zip(*reversed(ax.get_legend_handles_labels()), strict=True) for ax in axes)
-    return {name: artist for pairs in each for name, artist in pairs}
-
-
-def legend_below(figure: Figure, entries: dict[str, Any]) -> None:
-    """Draw a legend below all panels; every line but the first adds to the figure's height."""
+    entries = {name: artist for pairs in each for name, artist in pairs}
+    entries = {name: entries[name] for name in first if name in entries} | entries
     if not entries:
         return
     # In points: 4.2 per letter, 33 for a handle with its margins.

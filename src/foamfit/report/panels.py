@@ -212,7 +212,7 @@ FARTHER = (1.0, 2.5, 4.0)
 LIGHT = {"a": 0.9, "c": 0.5}  # place of the name along an elastic branch, over its length
 
 
-def annotate(ax: Axes, panel: Panel, result: Fit, size: tuple[float, float]) -> None:
+def annotate(result: Fit, ax: Axes, panel: Panel, size: tuple[float, float]) -> None:
     """Add everything except the curves to a panel of about this size in points."""
     _mark_outliers(ax, panel, result)
     labels = _Labels(ax, panel, size)

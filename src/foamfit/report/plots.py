@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,12 +57,8 @@ def plot_fit(result: Fit, *, width: str = TWO) -> Figure:
     more = [word] if word and word not in name.lower() else []
     more += [f"stopped by {result.stopped}"] if result.stopped else []
     title = " · ".join([name, result.law, f"{result.drive} drive", *more])
-
-    def add(ax: Axes, panel: Panel, size: tuple[float, float]) -> None:
-        annotate(ax, panel, result, size)
-
-    known = is_known(result)
-    return panelled(panels_of(result), width, title, strips=True, known=known, add=add)
+    how: Any = {"strips": True, "known": is_known(result), "add": partial(annotate, result)}
+    return panelled(panels_of(result), width, title, **how)
 
 
 def draw_panel(result: Fit, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
@@ -75,7 +72,7 @@ def draw_panel(result: Fit, ax: Axes | None = None, what: str = "stress-strain")
     with figures.axes_or_new(ax) as ax:
         draw(ax, panels[what])
         wide, high = (72.0 * side / ax.figure.dpi for side in ax.bbox.size)
-        annotate(ax, panels[what], result, (wide, high))
+        annotate(result, ax, panels[what], (wide, high))
         ax.legend(loc="best", fontsize="small")
     return ax
 
@@ -188,7 +185,7 @@ def panelled(
                 high += below
             places.append((ax, x, y, spans[column], high))
             add(ax, panel, (spans[column], high))
-        figures.legend_below(figure, figures.named_in(figure.axes))
+        figures.legend_below(figure, figure.axes)
         whole = 72.0 * figure.get_figheight()
         for ax, x, y, span, high in places:
             ax.set_position(
@@ -217,9 +214,7 @@ def plot_profiles(result: Fit) -> Figure | None:
         name = one.name if one.complete else f"{one.name}, stopped"
         lines = _profile_lines(one, estimate.stderr)
         panels.append(Panel(one.name, (name, estimate.unit), ("rise of χ²", ""), lines))
-    if not panels:
-        return None
-    return panelled(panels, TWO)
+    return panelled(panels, TWO) if panels else None
 
 
 def _profile_lines(profile: Profile, stderr: float | None) -> list[Line]:
@@ -270,7 +265,7 @@ def plot_snapping(result: Fit) -> Figure | None:
             below.axvline(time[sample] / factor, color=GREY, lw=0.5, ls=":", zorder=0)
             below.annotate(f"{number}", (time[sample] / factor, 104.0), ha="center", fontsize=7)
         below.set(xlabel=f"time ({unit})", ylabel="micro-springs (%)", ylim=(0.0, 115.0))
-        figures.legend_below(figure, figures.named_in([below]))
+        figures.legend_below(figure, [below])
     return figure
 
 

@@ -12,15 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
 from foamfit.errors import InputError
-from foamfit.solve import cache, histories
-from foamfit.solve import scene as scenes
+from foamfit.solve import cache, histories, scene as scenes
 from foamfit.solve.compiled import along, loop, rates, static
 from foamfit.solve.compiled.run import AT, ENDED, FINITE, NOW, OUTCOME, POINTS, SWITCHES, TOLD
 from foamfit.solve.compiled.samples import increases
 from foamfit.solve.layout import Layout, Memory, Shape, lay_out
-from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM
-from foamfit.solve.scene import NO_SWITCHES, Slopes
-from foamfit.solve.scene import Motion as Motion
+from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM, NO_SWITCHES, Motion as Motion, Slopes
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled, slopes_of
 from foamfit.springs.compiled.contract import FLOWS, INTERNAL, TINY, Compiled

@@ -107,9 +107,7 @@ def plot_parameters(
         axes[0].set_yticks(range(0, count, step), names, parse_math=False)
         if not panels:
             figures.say_nothing_there(axes[0], "no parameter to compare")
-        entries = figures.named_in(axes)
-        marks = {label: entries[label] for label in _MARKS if label in entries}
-        figures.legend_below(figure, marks | entries)
+        figures.legend_below(figure, axes, first=_MARKS)
     return figure
 
 

@@ -259,7 +259,7 @@ def plot_plan(plan: Plan, *, width: str = TWO) -> Figure:
         left, right = figure.subplots(2, 1) if stacked else figure.subplots(1, 2)
         _map(left, plan)
         draw_intervals(right, plan)
-        figures.legend_below(figure, figures.named_in([left, right]))
+        figures.legend_below(figure, [left, right])
     return figure
 
 

@@ -22,8 +22,7 @@ import math
 
 from numba import njit
 
-from foamfit.springs.compiled import contract
-from foamfit.springs.compiled import mixture as mix
+from foamfit.springs.compiled import contract, mixture as mix
 from foamfit.springs.compiled.contract import BY, BY_HELD, MISS, OF_LAW, SLOPE, inner, past, start
 from foamfit.springs.compiled.mixture import AGAIN, BACK, BOTH, FIXED, SNAP, A, at_stress, shares
 from foamfit.springs.law import most_beyond

@@ -19,9 +19,7 @@ from foamfit.springs.laws import bistable, linear, microscale
 from foamfit.springs.laws.bistable import BistableSpring as BistableSpring
 from foamfit.springs.laws.linear import LinearSpring as LinearSpring
 from foamfit.springs.laws.microscale import MicroscaleSpring as MicroscaleSpring
-from foamfit.springs.laws.record import Functions as Functions
-from foamfit.springs.laws.record import Law as Law
-from foamfit.springs.laws.record import Param as Param
+from foamfit.springs.laws.record import Functions as Functions, Law as Law, Param as Param
 
 ENTRY_POINTS = "foamfit.laws"
 _BUILT_IN = (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, *microscale.LAWS)
