@@ -19,13 +19,12 @@ from foamfit.options import Keywords, documented
 from foamfit.report.folder import Result, brief, write_result
 from foamfit.report.plots import draw_panel
 from foamfit.report.readable import readable
-from foamfit.report.summary import compared, summary_text
+from foamfit.report.summary import misfit_words, misfits, summary_text
 from foamfit.report.tables import frame
 from foamfit.results import Fit
 from foamfit.solve.precompile import compile_solver
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import unit_of
-from foamfit.text import percent
 from foamfit.trust.intervals import Announce
 
 if TYPE_CHECKING:
@@ -88,8 +87,8 @@ class FitResult(Result, Fit):
 
     def __repr__(self) -> str:
         """Return status, model, misfit and parameters."""
-        misfits = ", ".join(f"{name} {percent(misfit)}" for name, misfit in compared(self).items())
-        line = f"{self.law}, {self.drive} drive · status {self.status} · misfit: {misfits or '–'}"
+        found = misfit_words(misfits(self)) or "–"
+        line = f"{self.law}, {self.drive} drive · status {self.status} · misfit: {found}"
         rows = [readable(name, p) for name, p in self.parameters.items() if p.state != "fixed"]
         return brief(self.measurement.name, line, rows)
 

@@ -80,7 +80,8 @@ def _leave(code: int, message: str, lines: Sequence[str] = ()) -> NoReturn:
 def _one_sentence(error: click.ClickException) -> str:
     """Return click's message as one sentence that refers to --help."""
     message = error.format_message()
-    if isinstance(error, click.UsageError) and not isinstance(error, click.BadParameter):
+    value = isinstance(error, click.BadParameter) and not isinstance(error, click.MissingParameter)
+    if isinstance(error, click.UsageError) and not value:
         path = error.ctx.command_path if error.ctx else "foamfit"
         message = message.replace(". Did you", ", did you").replace(". (Did you", " (did you")
         message = f"{message.rstrip('.?')}; see {path} --help"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -65,10 +64,7 @@ class Watcher(Progress):
 
 
 class ProgressLine(Watcher):
-    """A line of the terminal, beginning with `name`, with a bar of tqdm.
-
-    The misfit is the RMS of all fitted curves, each divided by its measured range.
-    """
+    """A line of the terminal, beginning with `name`, with a bar of tqdm and the largest misfit."""
 
     def __init__(self, stream: TextIO, name: str) -> None:
         from tqdm import tqdm
@@ -100,12 +96,9 @@ class ProgressLine(Watcher):
         self._bar.update(max(min(fraction, 1.0) - self._bar.n, 0.0))
 
     def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
-        """Receive the misfits; show that of all fitted curves together."""
-        objective = problem.objective
-        pairs = zip(objective.counted, objective.sizes, strict=True)
-        squares = sum(size * (misfit[name] or 0.0) ** 2 for name, size in pairs)
-        whole = math.sqrt(squares / objective.n_data)
-        self.misfit = whole if self.misfit is None else min(self.misfit, whole)
+        """Receive the misfits; show the largest of the fitted curves."""
+        largest = max(misfit[name] or 0.0 for name in problem.objective.counted)
+        self.misfit = largest if self.misfit is None else min(self.misfit, largest)
 
     def tell(self, text: str) -> None:
         """Print a sentence above the line."""

@@ -20,8 +20,7 @@ from foamfit.page.inputs import WIDE, Sliders, grid, piece
 from foamfit.page.turning import PANELS, Drawn, Row, Turning
 from foamfit.report.figures import GREY, VERMILION
 from foamfit.report.panels import AXES, Line, Panel
-from foamfit.report.summary import CURVES
-from foamfit.text import percent
+from foamfit.report.summary import CURVES, misfit_words
 
 MOST_DRAWN, MOST_MARKERS = 400, 150  # largest number of points of a simulated and a measured curve
 NOTHING = np.empty(0), np.empty(0)
@@ -210,5 +209,4 @@ class Curves:
 
 def misfits_text(misfit: Mapping[str, float | None]) -> str:
     """Return the misfits of the panels in words."""
-    shown = {CURVES[name]: misfit.get(name) for name in PANELS}
-    return ", ".join(f"{name} {percent(off)}" for name, off in shown.items() if off is not None)
+    return misfit_words({CURVES[name]: misfit.get(name) for name in PANELS})

@@ -47,7 +47,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
         "result": result,
         "m": measured,
         "ladder": ladder,
-        "shown": [(name, percent(misfit)) for name, misfit in compared(result).items()],
+        "shown": misfit_words(misfits(result)),
         "fixed": [row for row in rows if row.state == "fixed"],
         "determined": determined(result),
         "unknown": _unknown(_of_springs(result), "report"),
@@ -141,9 +141,10 @@ def misfits(result: Fit) -> dict[str, float | None]:
     return {name: result.misfit.get(key) for key, name in names.items()}
 
 
-def compared(result: Fit) -> dict[str, float]:
-    """Return the misfits of the curves that are compared."""
-    return {name: misfit for name, misfit in misfits(result).items() if misfit is not None}
+def misfit_words(misfits: Mapping[str, float | None]) -> str:
+    """Return the misfits of curves by their names, in words; "" if none is compared."""
+    known = (f"{name} {percent(one)}" for name, one in misfits.items() if one is not None)
+    return ", ".join(known)
 
 
 def conclusions(result: Fit) -> tuple[str, ...]:
@@ -163,7 +164,7 @@ def conclusions(result: Fit) -> tuple[str, ...]:
     return sentences(
         "conclusions",
         result=result,
-        shown=compared(result),
+        shown={name: one for name, one in misfits(result).items() if one is not None},
         determined=found,
         varied=varied,
         widths=widths[:1] + widths[1:][-1:],

@@ -167,7 +167,7 @@ class JointResult(Result, OfLaw):
 
     def __repr__(self) -> str:
         """Return name, model, number of tests, status and the common values."""
-        line = f"{self.model} · {counted(len(self.tests), 'test')} together · status {self.status}"
+        line = f"{self.law} · {counted(len(self.tests), 'test')} together · status {self.status}"
         rows = [readable(name, p) for name, p in self.varied.items()]
         return brief(self.name, line, rows)
 
@@ -251,7 +251,7 @@ def plot_joint(found: JointResult, *, width: str = figures.TWO) -> Figure:
         )
         for own, (name, one) in zip(symbols(found.varied), found.varied.items(), strict=True)
     ]
-    title = f"{found.name} · {found.model} · {len(names)} tests together"
+    title = f"{found.name} · {found.law} · {len(names)} tests together"
     above = partial(draw_loops, [shown[i] for i in kept[: len(shown)]]) if shown else None
     return plot_parameters(title, list(names.values()), panels, width=width, above=above)
 

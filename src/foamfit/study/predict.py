@@ -26,7 +26,7 @@ from foamfit.parts import ParameterEstimate
 from foamfit.report import render
 from foamfit.report.folder import Result
 from foamfit.report.studies.prediction import COLOURS, PredictedCurve, Prediction
-from foamfit.springs.parameters import unit_of
+from foamfit.springs.parameters import NUISANCE, unit_of
 from foamfit.study.identified import NORMAL, Source, read_source
 from foamfit.study.population import Population
 from foamfit.text import engineering
@@ -131,7 +131,7 @@ def predict(
     told["untold"] = [one.channel for one in bands.values() if one.channel not in source.misses]
     told["missed"] = [one for one in bands.values() if one.inside < LEAST_INSIDE]
     told["aligned"] = [
-        f"{name.replace('_', ' ')} {engineering(value, unit_of(name)).replace('-', '−')}"
+        f"{NUISANCE[name].what} {engineering(value, unit_of(name))}"
         for name, value in aligned.items()
     ]
     return Prediction(
