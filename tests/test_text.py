@@ -5,21 +5,8 @@ import math
 import pytest
 
 import fabricated
+from foamfit import text as t
 from foamfit.report.readable import in_unit, readable
-from foamfit.text import (
-    WIDTH,
-    aligned,
-    counted,
-    engineering,
-    labelled,
-    listed,
-    number,
-    percent,
-    signed,
-    significant,
-    times,
-    wrapped,
-)  # fmt: skip
 
 
 def ranged(low: float, high: float, unit: str = "Pa") -> str:
@@ -30,32 +17,34 @@ def ranged(low: float, high: float, unit: str = "Pa") -> str:
 @pytest.mark.parametrize(
     ("made", "text"),
     [
-        (engineering(3.839e6, "Pa"), "3.839 MPa"),
-        (engineering(999960.0, "Pa"), "1 MPa"),
-        (engineering(0.0, "m"), "0 m"),
-        (engineering(-2e-6, "m"), "−2 µm"),
-        (engineering(1e12, "Pa"), "1000 GPa"),
-        (engineering(-410.0, "Pa", 6214.0), "−0.4 ± 6.2 kPa"),
+        (t.engineering(3.839e6, "Pa"), "3.839 MPa"),
+        (t.engineering(999960.0, "Pa"), "1 MPa"),
+        (t.engineering(0.0, "m"), "0 m"),
+        (t.engineering(-2e-6, "m"), "−2 µm"),
+        (t.engineering(1e12, "Pa"), "1000 GPa"),
+        (t.engineering(7200.0, "s"), "7200 s"),
+        (t.engineering(0.593, "m/s"), "0.593 m/s"),
+        (t.engineering(-410.0, "Pa", 6214.0), "−0.4 ± 6.2 kPa"),
         (in_unit((1.7e4, 1.7e11), "Pa"), "17.00 kPa to 170.0 GPa"),
         (ranged(1.7e4, 1.7e11), "17 kPa to 170 GPa"),
         (ranged(0.042, 0.1, ""), "0.042 to 0.10"),
         (ranged(8.9e-5, 230.0, "Pa s"), "0 to 230"),
-        (times(1234.5), "1,230"),
-        (number(0.0123), "0.01230"),
-        (number(-1.2e-7), "−1.200e−07"),
-        (number(math.nan), "–"),
-        (significant(138.4), "140"),
-        (significant(9.97), "10"),
-        (significant(1.2e-5), "0.000012"),
-        (percent(1.384), "140 %"),
-        (percent(1e-9), "less than 0.001 %"),
-        (signed(1.23, 1), "+1.2"),
-        (signed(-0.31, 1), "−0.3"),
-        (signed(-0.04, 1), "0.0"),
-        (counted(1, "sample"), "1 sample"),
-        (counted(0, "sample"), "0 samples"),
-        (listed("a"), "a"),
-        (listed("abc"), "a, b and c"),
+        (t.times(1234.5), "1,230"),
+        (t.number(0.0123), "0.01230"),
+        (t.number(-1.2e-7), "−1.200e−07"),
+        (t.number(math.nan), "–"),
+        (t.significant(138.4), "140"),
+        (t.significant(9.97), "10"),
+        (t.significant(1.2e-5), "0.000012"),
+        (t.percent(1.384), "140 %"),
+        (t.percent(1e-9), "less than 0.001 %"),
+        (t.signed(1.23, 1), "+1.2"),
+        (t.signed(-0.31, 1), "−0.3"),
+        (t.signed(-0.04, 1), "0.0"),
+        (t.counted(1, "sample"), "1 sample"),
+        (t.counted(0, "sample"), "0 samples"),
+        (t.listed("a"), "a"),
+        (t.listed("abc"), "a, b and c"),
     ],
 )
 def test_numbers_and_lists(made: str, text: str) -> None:
@@ -64,13 +53,13 @@ def test_numbers_and_lists(made: str, text: str) -> None:
 
 def test_lines_keep_their_width_and_their_words() -> None:
     text = "word " * 60
-    lines = wrapped(text)
+    lines = t.wrapped(text)
     assert " ".join(lines).split() == text.split()
-    assert max(map(len, lines)) <= WIDTH
+    assert max(map(len, lines)) <= t.WIDTH
     assert all(line.startswith("  word") for line in lines[1:])
     # No line begins with the % sign of a number.
-    assert wrapped("a spread of 4.1 % to 20 %", width=15) == ["a spread of", "  4.1 % to 20 %"]
-    lines = labelled([("done", [text, "end"]), ("none", [])]).splitlines()
+    assert t.wrapped("a spread of 4.1 % to 20 %", width=15) == ["a spread of", "  4.1 % to 20 %"]
+    lines = t.labelled([("done", [text, "end"]), ("none", [])]).splitlines()
     assert lines[1].startswith(" " * 12 + "word")
     assert lines[-1] == " " * 10 + "end"
 
@@ -82,7 +71,7 @@ def test_text_and_tables_fit_the_terminal(
     """Columns that do not fit follow below, again next to the first column."""
     monkeypatch.setenv("COLUMNS", columns)
     rows = [["parameter", *"abcdefghij"], *([name, *["1234567 MPa"] * 10] for name in ("k0", "kc"))]
-    lines = aligned(rows)
-    assert max(map(len, [*lines, *wrapped("word " * 60)])) <= most
+    lines = t.aligned(rows)
+    assert max(map(len, [*lines, *t.wrapped("word " * 60)])) <= most
     assert sum(line.count("1234567 MPa") for line in lines) == 20
     assert all(line.startswith(("parameter", "k0", "kc")) for line in lines if line)

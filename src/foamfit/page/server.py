@@ -133,6 +133,8 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
             if browser:
                 await asyncio.to_thread(webbrowser.open, page.address)
             await ending.wait()
+            # Messages of windows that are still open are cancelled.
+            logging.getLogger("tornado.application").setLevel(logging.CRITICAL)
         finally:
             page.close()
 
