@@ -15,14 +15,15 @@ COLUMN = 10  # column in which the text after a label begins
 _NO_BREAK = "\u00a0"  # no-break space
 _PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "µ": 1e-6, "n": 1e-9}
 # Prefixes that are usual before a unit: no one says 7.2 ks or 593 mm/s.
-_USUAL = {"Pa": "GMk", "J/m³": "GMk", "Hz": "GMk", "N": "km", "g": "kmµ", "s": "mµn", "m": "mµn"}
+_USUAL = {"Pa": "GMk", "J/m³": "GMk", "Hz": "GMk", "N": "Mkm", "g": "kmµ", "s": "mµn", "m": "mµn"}
 # Names of a unit for large and small numbers, with their factors, the largest first.
 UNITS = {
     unit: sorted(((_PREFIXES[one], one + unit) for one in ("", *prefixes)), reverse=True)
     for unit, prefixes in _USUAL.items()
 }
 UNITS["kg"] = [(1e-3 * factor, name) for factor, name in UNITS["g"]]
-UNITS |= {"Pa s": [(1.0, "Pa·s")], "m/s^2": [(1e3, "km/s²"), (1.0, "m/s²")]}
+UNITS["m/s^2"] = UNITS["m/s²"] = [(1e3, "km/s²"), (1.0, "m/s²")]
+UNITS["Pa s"] = [(1.0, "Pa·s")]
 
 
 def readable_unit(size: float, unit: str) -> tuple[float, str]:
@@ -40,7 +41,7 @@ def engineering(value: float, unit: str, error: float = 0.0) -> str:
     With a standard error both are rounded to two digits of it: "3.839 ± 0.012 MPa".
     """
     factor, name = readable_unit(float(f"{max(abs(value), error):.3e}"), unit)
-    shown = f"{value / factor:.4g}".replace("-", "−")
+    shown = significant(value / factor, 4).replace("-", "−")
     if error:
         shown = " ± ".join(with_error(value / factor, error / factor)[:2])
     return f"{shown} {name}".rstrip()
