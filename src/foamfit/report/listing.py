@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.codec import build, decode, plain
+from foamfit.codec import build, plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.parts import ParameterEstimate
@@ -123,20 +123,14 @@ def _listed(path: Path) -> Row:
         given = content.get("options") or {"drive": content.get("drive")}
         given = {"relaxation": content.get("relaxation"), **model.options, **given, "model": None}
         rest = (k if v is True else f"{k} {option_value(v)}" for k, v in given.items() if v)
-        misfit = content.get("misfit") or _largest(content.get("tests", {}))
         every = content["parameters"].items()
         made = {n: {"vary": p.get("kind") != "fixed", **p} for n, p in every if n not in NUISANCE}
-        return Row(
-            str(content.get("test") or content.get("name")),
-            status=str(content["status"]),
-            misfit=decode(dict[str, float | None], misfit, {}),
-            runtime_s=decode(float | None, content.get("runtime_s"), {}),
-            parameters={name: build(ParameterEstimate, p, {}) for name, p in made.items()},
-            model=model.words,
-            options=", ".join(rest),
-            place=place,
-            when=when,
-        )
+        about: dict[str, Any] = {"test": content.get("test") or content["name"]}
+        about |= {"status": content["status"], "runtime_s": content.get("runtime_s")}
+        about["misfit"] = content.get("misfit") or _largest(content.get("tests", {}))
+        about |= {"parameters": made, "model": model.words, "options": ", ".join(rest)}
+        row: Row = build(Row, about, {})
+        return replace(row, place=place, when=when)
     except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
         why = str(error) if isinstance(error, InputError) else f"{path.name} is damaged"
         return Row(place.name, status="failed", error=why, place=place, when=when)
