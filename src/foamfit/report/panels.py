@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.report.figures import BLUE, GREY, INSIDE, VERMILION
-from foamfit.results import Fit
+from foamfit.results import Fit, Switch
 from foamfit.text import readable_unit
 
 if TYPE_CHECKING:
@@ -298,6 +298,12 @@ def _mark_switches(labels: _Labels, panel: Panel, result: Fit) -> None:
         labels.write(name, [np.array(places[0])], fontsize=7)
 
 
+def _place(switch: Switch, result: Fit) -> tuple[float, float, float]:
+    """Return displacement, strain and stress of a switch as the measured curves show them."""
+    moved = switch.displacement + result.zero_of("displacement")
+    return moved, moved / result.measurement.specimen.height, result.as_read(switch.stress)
+
+
 def _points(panel: Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
     """Yield spring, name, x and y of changes of branch and of half-snapped micro-springs.
 
@@ -306,12 +312,12 @@ def _points(panel: Panel, result: Fit) -> Iterator[tuple[str, str, float, float]
     for switch in result.switches:
         ends, x = (switch.source, switch.target), switch.time
         name = POINTS.get("".join(ends))
-        moved = switch.displacement + result.zero_of("displacement")
+        moved, strain, stress = _place(switch, result)
         if panel.is_loop:
-            x = moved / result.measurement.specimen.height
+            x = strain
         remembers = result.chain.springs[switch.spring - 1].law.remembers
         if x is not None and not (name is None and remembers):
-            y = moved if panel.name == "displacement-time" else result.as_read(switch.stress)
+            y = moved if panel.name == "displacement-time" else stress
             yield f"s{switch.spring}", name or "→".join(ends), x, y
     for spring, snapped in result.snapping.items():
         for symbol, sample in zip(("σ₊", "σ₋"), snapped.halves, strict=True):
@@ -374,9 +380,7 @@ def _switch_samples(result: Fit, loop: Line) -> list[int]:
         if time is not None and switch.time is not None:
             samples.append(min(int(np.searchsorted(time, switch.time)), loop.x.size - 1))
         else:  # the nearest sample after the previous switch
-            moved = switch.displacement + result.zero_of("displacement")
-            strain = moved / result.measurement.specimen.height
-            stress = result.as_read(switch.stress)
+            _, strain, stress = _place(switch, result)
             x, y = loop.x[samples[-1] :] - strain, loop.y[samples[-1] :] - stress
             distance = np.hypot(x / (np.ptp(loop.x) or 1.0), y / (np.ptp(loop.y) or 1.0))
             samples.append(samples[-1] + int(np.argmin(distance)))

@@ -57,8 +57,8 @@ def plot_fit(result: Fit, *, width: str = TWO) -> Figure:
     more = [word] if word and word not in name.lower() else []
     more += [f"stopped by {result.stopped}"] if result.stopped else []
     title = " · ".join([name, result.law, f"{result.drive} drive", *more])
-    how: Any = {"strips": True, "known": is_known(result), "add": partial(annotate, result)}
-    return panelled(panels_of(result), width, title, **how)
+    add = partial(annotate, result)
+    return panelled(panels_of(result), width, title, known=is_known(result), add=add)
 
 
 def draw_panel(result: Fit, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
@@ -147,13 +147,12 @@ def panelled(
     panels: list[Panel],
     width: str,
     *title: str,
-    strips: bool = False,
     known: bool = False,
     add: Callable[[Axes, Panel, tuple[float, float]], object] = lambda *_: None,
 ) -> Figure:
     """Draw panels with a legend below them.
 
-    Strips are drawn below the panels if wanted; for a `known` motion the first panel is largest.
+    The strips of the panels are below them; for a `known` motion the first panel is largest.
     `add` draws more into a panel of a size in points. Places are given, as finding them from the
     sizes of all texts takes as long as drawing the figure.
     """
@@ -163,7 +162,7 @@ def panelled(
     rows, parts = -(-count // across), [WIDER if known else 1.0, *[1.0] * (across - 1)]
     spans = [(72.0 * wide - RIGHT) * part / sum(parts) - LEFT for part in parts]
     tall = LOOP if known and across > 1 else HEIGHT if rows == 1 else STACKED
-    below = GAP + STRIP if strips else 0.0
+    below = GAP + STRIP if any(panel.below for panel in panels) else 0.0
     top = ABOVE + max((TITLE for panel in panels if panel.title), default=0.0)
     cell = top + tall + below + BELOW
     height, title = (rows * cell + LEGEND) / 72.0, figures.title(width, *title)
@@ -177,7 +176,7 @@ def panelled(
             (row, column), high = divmod(i, across), tall
             x, y = (column + 1) * LEFT + sum(spans[:column]), title_high + row * cell + top
             draw(ax, panel)
-            if strips and panel.below:
+            if panel.below:
                 strip = figure.add_axes((0.0, 0.0, 1.0, 1.0))
                 draw_below(ax, strip, panel)
                 places.append((strip, x, y + tall + GAP, spans[column], STRIP))

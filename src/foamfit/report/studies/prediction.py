@@ -208,8 +208,7 @@ def plot_prediction(found: Prediction, *, width: str = TWO) -> Figure:
     inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in found.curves.values())
     about = f"{found.measurement.name}, predicted from {found.source}"
     title = f"{about}; {words('rates', found=found)}", f"inside the 95 % band: {inside}"
-    known = found.drive == "displacement"
-    return panelled(_panels(found), width, *title, strips=True, known=known)
+    return panelled(_panels(found), width, *title, known=found.drive == "displacement")
 
 
 def _panels(found: Prediction) -> list[Panel]:
