@@ -459,8 +459,9 @@ def test_what_is_no_result_is_refused(tmp_path):
     path.unlink()
     with pytest.raises(InputError, match="is not a result folder"):
         ff.predict(tmp_path, loop(seed=0))
-    (tmp_path / "cycles.json").write_text("{}")
-    with pytest.raises(InputError, match="several cycles; name one"):
+    (tmp_path / "cycle-1").mkdir()
+    (tmp_path / "cycle-1" / "fit.json").write_text("{}")
+    with pytest.raises(InputError, match=r"contains 1 fit; name one, like .*cycle-1"):
         ff.predict(tmp_path, loop(seed=0))
 
 

@@ -26,7 +26,7 @@ from foamfit.report.readable import Readable
 from foamfit.report.summary import render_report
 from foamfit.report.tables import numbers_of, parameters_tex, with_head
 from foamfit.results import SCHEMA, Fit
-from foamfit.text import wrapped
+from foamfit.text import counted, wrapped
 
 SAMPLES = "samples.npz"
 # Files of each kind of result, by the file that identifies it. They include files that only older
@@ -273,12 +273,12 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     """
     path = Path(folder)
     if path.is_dir():
-        for name, what in (("joint.json", "tests"), ("cycles.json", "cycles")):
-            if (path / name).is_file():
-                inside = sorted(str(one.parent) for one in path.glob("*/fit.json"))
-                example = f", like {inside[0]}" if inside else ""
-                raise InputError(f"{path} contains fits of several {what}; name one{example}")
+        inside = sorted(str(one.parent) for one in path.glob("*/fit.json"))
         path = path / "fit.json"
+        if inside and not path.is_file():
+            raise InputError(
+                f"{folder} contains {counted(len(inside), 'fit')}; name one, like {inside[0]}"
+            )
     try:
         content = json.loads(read_whole(path))
     except OSError as error:
