@@ -138,11 +138,9 @@ def _listed(path: Path) -> Row:
 
 def _largest(tests: dict[str, Any]) -> dict[str, float]:
     """Return the largest misfit of each curve over the tests of a joint fit."""
-    out = dict[str, float]()
-    for one in tests.values():
-        for name, value in one["misfit"].items():
-            out[name] = max(out.get(name, 0.0), value or 0.0)
-    return {name: value for name, value in out.items() if value}
+    found = [one["misfit"] for one in tests.values()]
+    names = dict.fromkeys(name for one in found for name, value in one.items() if value)
+    return {name: max(one.get(name) or 0.0 for one in found) for name in names}
 
 
 def small_loop(path: Path) -> tuple[str, ...]:

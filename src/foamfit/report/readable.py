@@ -10,7 +10,8 @@ from foamfit.parts import ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
 from foamfit.text import UNITS, fixed, number, readable_unit, with_error
 
-APART = 1e3  # ratio of two numbers from which each has a unit of its own
+# Ratio of two numbers from which each has a unit of its own, if `UNITS` has more than one.
+APART = 1e3
 NOTHING = 1e-4  # a number below this share of another is zero beside it, if units have no prefix
 
 
@@ -84,7 +85,7 @@ def _span(ends: tuple[float, float], unit: str, factor: float) -> str:
     least, most = sorted(map(abs, ends))
     width = ends[1] - ends[0]
     digits = 2 + (math.floor(math.log10(most / width)) if 0.0 < 10.0 * width < most else 0)
-    if _has_prefixes(unit) and (0.0 < APART * least <= most or most >= 10.0 * APART * factor):
+    if UNITS.get(unit, [])[1:] and (0.0 < APART * least <= most or most >= 10.0 * APART * factor):
         return in_unit(ends, unit, digits)
     seen = (end / factor if abs(end) > NOTHING * most else 0.0 for end in ends)
     return " to ".join(_few(end, digits) for end in seen)
@@ -101,14 +102,10 @@ def in_unit(values: Sequence[float], unit: str, digits: int = 4) -> str:
     Ends that lie decades apart have a unit each: "17 kPa to 170 GPa".
     """
     sizes = [abs(value) for value in values if value]
-    if _has_prefixes(unit) and sizes and max(sizes) >= APART * min(sizes):
+    if UNITS.get(unit, [])[1:] and sizes and max(sizes) >= APART * min(sizes):
         return " to ".join(in_unit([value], unit, digits) for value in values)
     factor, name = readable_unit(max(sizes, default=0.0), unit)
     return f"{' to '.join(_few(value / factor, digits) for value in values)} {name}".rstrip()
-
-
-def _has_prefixes(unit: str) -> bool:
-    return len(UNITS.get(unit, ())) > 1
 
 
 def _few(value: float, digits: int) -> str:
