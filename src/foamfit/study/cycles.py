@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
-
-import numpy as np
 
 from foamfit.api import fit
 from foamfit.arrays import single_threaded
@@ -38,7 +35,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ENERGY = "dissipated_energy"
-MOST_LOOPS = 12
 MOST_NAMES = 12  # more parameters than this are not printed; all are in cycles.csv
 # Panels next to the parameters: columns of cycles.csv (SI), and their factors.
 BY_CYCLE = {
@@ -214,9 +210,9 @@ def fit_cycles(
 
 
 def plot_cycles(found: CycleFits, *, width: str = figures.TWO) -> Figure:
-    """Draw all loops in one panel, and start strain, energy, misfit and parameters by cycle.
+    """Draw the loops in one panel, and start strain, energy, misfit and parameters by cycle.
 
-    For the parameters see `plot_parameters`. At most `MOST_LOOPS` loops are drawn.
+    See `plot_parameters`.
     """
     results = dict(sorted(found.results.items()))
     loops = [
@@ -228,19 +224,12 @@ def plot_cycles(found: CycleFits, *, width: str = figures.TWO) -> Figure:
         for number, one in results.items()
         if (loop := one.loop) is not None and loop.label == "strain"
     ]
-    keep = np.arange(len(loops))
-    if len(loops) > MOST_LOOPS:
-        keep = np.unique(np.geomspace(1, len(loops), MOST_LOOPS).astype(int)) - 1
     rows, panels = list(found.rows()), list[Panel]()
     for title, (column, factor) in BY_CYCLE.items():
         known = {f"cycle {row['cycle']}": row[column] for row in rows if row[column] is not None}
         values = {n: ParameterEstimate(factor * x, state="determined") for n, x in known.items()}
         panels.append(Panel(column, title, values))
     names = [f"cycle {number}" for number in results]
-    return plot_parameters(
-        f"{found.test} · {found.model}",
-        names,
-        [*panels, *panels_of(names, found.varied)],
-        width=width,
-        above=partial(draw_loops, [loops[i] for i in keep]),
-    )
+    panels += panels_of(names, found.varied)
+    title = f"{found.test} · {found.model}"
+    return plot_parameters(title, names, panels, width=width, loops=loops)

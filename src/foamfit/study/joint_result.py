@@ -54,7 +54,6 @@ DOMINANT, MORE = 0.5, 2.0
 # away less by the factor `MORE`.
 SCALED = 0.3
 MOST_ROWS = 60  # of the table of tests on the terminal
-MOST_LOOPS = 48
 SEVERAL_RATES = 1.5  # ratio of rates; those of nominally equal tests differ by a few percent
 
 
@@ -236,12 +235,10 @@ def _more(found: JointResult, own: JointTest) -> dict[str, Any]:
 def plot_joint(found: JointResult, *, width: str = figures.TWO) -> Figure:
     """Draw the loops, and below them the parameters of all tests side by side.
 
-    Tests are sorted by rate if rates differ. At most `MOST_LOOPS` loops are drawn.
+    Tests are sorted by rate if rates differ; see `plot_parameters`.
     """
-    names = _in_order(found)
-    loops = {one.name: one for one in found.loops}
-    shown = [loops[test]._replace(name=name) for test, name in names.items() if test in loops]
-    kept = np.unique(np.linspace(0, max(len(shown) - 1, 0), MOST_LOOPS).astype(int))
+    names, every = _in_order(found), {one.name: one for one in found.loops}
+    loops = [every[test]._replace(name=name) for test, name in names.items() if test in every]
     panels = [
         Panel(
             name,
@@ -252,8 +249,7 @@ def plot_joint(found: JointResult, *, width: str = figures.TWO) -> Figure:
         for own, (name, one) in zip(symbols(found.varied), found.varied.items(), strict=True)
     ]
     title = f"{found.name} · {found.law} · {len(names)} tests together"
-    above = partial(draw_loops, [shown[i] for i in kept[: len(shown)]]) if shown else None
-    return plot_parameters(title, list(names.values()), panels, width=width, above=above)
+    return plot_parameters(title, list(names.values()), panels, width=width, loops=loops)
 
 
 def _in_order(found: JointResult) -> dict[str, str]:
@@ -272,16 +268,19 @@ def _in_order(found: JointResult) -> dict[str, str]:
 
 
 def fit_of_test(
-    problem: Problem, values: Array, parameters: dict[str, ParameterEstimate], note: str, seed: int
+    problem: Problem, values: Array, varied: dict[str, ParameterEstimate], note: str, seed: int
 ) -> Fit:
-    """Return the result of a test in a joint fit; `systematic` is from this test alone."""
+    """Return the result of a test in a joint fit; `systematic` is from this test alone.
+
+    `varied` are its estimates in the joint fit.
+    """
     problem.put(values)
     alone = conclude(BestPoint(problem, values), SearchRecord(seed, 0, time.perf_counter()))
     checks = tuple(check for check in alone.checklist if check.key not in _OF_A_SEARCH)
     verdict: Any = {"status": status_of(checks), "warnings": warnings_of(checks), "budget": None}
     own = {
-        name: replace(one, systematic=alone.parameters.get(name, one).systematic)
-        for name, one in parameters.items()
+        name: replace(varied.get(name, one), systematic=one.systematic)
+        for name, one in alone.parameters.items()
     }
     notes = (note, *alone.notes)
     return replace(alone, parameters=own, notes=notes, checklist=checks, **verdict)
@@ -311,7 +310,11 @@ def result_of(
     for t, ((name, file), rate, best) in enumerate(pairs):
         problem, values, curves = best.problem, found.values[t], best.simulated.curves
         measurement, objective = problem.measurement, problem.objective
-        estimates = _estimates(problem, values, name, parameters)
+        told = dict(zip(problem.names, (values + problem.origins).tolist(), strict=True))
+        varied = {n: parameters[n].in_test(name) for n in problem.free()}
+        for n, one in varied.items():
+            method = one.ci95 and "local covariance"
+            varied[n] = replace(one, value=told[n], ci95_method=method)
         of_tests[name] = JointTest(
             file=str(file),
             drive=objective.drive,
@@ -321,9 +324,9 @@ def result_of(
             noise=noise_of(best, fit.point.errors[t]),
             n_data=objective.n_data,
             data_sha256=measurement.data_sha256,
-            values={one: estimate.value for one, estimate in estimates.items()},
+            values={n: value for n, value in told.items() if not problem.is_exact(n)},
         )
-        fits.append(partial(fit_of_test, problem, values, estimates, note, study.seed))
+        fits.append(partial(fit_of_test, problem, values, varied, note, study.seed))
         loop = loop_of(measurement, curves.get("stress_strain"), curves.get("stress_time"))
         loops += [] if loop is None else [loop._replace(name=name)]
     drives = {one.drive for one in of_tests.values()}
@@ -353,24 +356,6 @@ def result_of(
         **about,
     )
     return _with_words(result, fit, alone, slopes)
-
-
-def _estimates(
-    problem: Problem, values: Array, test: str, parameters: Mapping[str, ParameterEstimate]
-) -> dict[str, ParameterEstimate]:
-    """Return the parameters of one test, as in its fit.json."""
-    out = dict[str, ParameterEstimate]()
-    for name, value in zip(problem.names, (values + problem.origins).tolist(), strict=True):
-        if problem.is_exact(name):
-            continue
-        one, param = parameters[name], problem.params[name]
-        if param.vary:
-            at = one.in_test(test)
-            out[name] = replace(at, value=value, ci95_method=at.ci95 and "local covariance")
-        else:
-            why = "held fixed" if param.expr is None else f"tied by {param.expr}"
-            out[name] = ParameterEstimate(value, None, None, one.unit, False, "fixed", why)
-    return out
 
 
 def _common_covariance(fit: JointFit) -> Array:

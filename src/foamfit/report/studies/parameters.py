@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from os.path import commonprefix
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ import numpy as np
 from foamfit.fitting.links import RATES
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, TWO, VERMILION
+from foamfit.report.plots import draw_loops
 from foamfit.report.tables import ByTest, formula, symbols, unit_of_all
 
 if TYPE_CHECKING:
@@ -19,10 +20,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
     from foamfit.parts import ParameterEstimate
+    from foamfit.results import Loop
 
 LEAST_PANEL, LETTER = 0.62, 0.052  # least width of a panel and width of a letter, inches
 TALLEST, ROW, ABOVE = 7.5, 0.17, 2.5  # heights of all panels, a row and the panel above, inches
-MOST_ROWS = 60  # tests that are named
+MOST_ROWS, MOST_LOOPS = 60, 24  # tests that are named, and whose loops are drawn
 ROOMY = 0.8  # width of a panel with room for more numbers, inches
 # Colours of edge and face of the marks.
 _MARKS = {"determined": (BLUE, BLUE), "weak": (BLUE, "white"), "not determined": (GREY, "white")}
@@ -74,13 +76,13 @@ def plot_parameters(
     panels: Sequence[Panel],
     *,
     width: str = TWO,
-    above: Callable[[Axes], object] | None = None,
+    loops: Sequence[Loop] = (),
 ) -> Figure:
     """Draw values with 95 % intervals, a panel per parameter, a row per test.
 
     A band is the 95 % interval of a common value, dashed lines its spread between specimens, ticks
     are references. Very wide intervals are cut; an arrow at the edge is a value outside the panel.
-    `above` draws a panel above the others; for `width` see `plots.plot_fit`.
+    A panel above the others has at most `MOST_LOOPS` loops; for `width` see `plots.plot_fit`.
     """
     wide, count, n = figures.inches(width), len(tests), max(len(panels), 1)
     step = max(-(-count // MOST_ROWS), 1)  # of very many tests only some are named
@@ -90,12 +92,13 @@ def plot_parameters(
     rows = -(-n // across)
     across = -(-n // rows)  # rows of equal length
     tall = min(max(ROW * count, 0.5), max(TALLEST / rows, 0.1 * len(names))) + 0.55
-    heights = [ABOVE if above else 0.0, rows * tall]
+    heights = [ABOVE if loops else 0.0, rows * tall]
     with figures.drawing(wide, sum(heights) + 0.3, *figures.title(width, title)) as figure:
         part: Figure | SubFigure = figure
-        if above is not None:
+        if loops:
             top, part = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
-            above(top.subplots())
+            few = np.unique(np.linspace(0, len(loops) - 1, MOST_LOOPS).astype(int))
+            draw_loops([loops[i] for i in few], top.subplots())
         axes = part.subplots(rows, across, squeeze=False, sharey=True).ravel().tolist()
         for ax in axes[n:]:
             ax.set_axis_off()
