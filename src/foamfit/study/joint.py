@@ -51,7 +51,6 @@ class _Test:
     name: str
     file: Path
     problem: Problem
-    params: lmfit.Parameters  # Before any fit
     rate: float | None  # 1/s
     values: Array = field(default_factory=lambda: np.empty(0))  # Parameters of the fit, SI
     cost: float = math.nan  # χ² per sample
@@ -136,24 +135,22 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
         try:
             test = read_test(path, specimen, study.cycle, cycles=study.cycles)
             if test.priors:
-                raise InputError(
-                    f"{path}: a joint fit accepts no [priors]; leave them out of the TOML of the "
-                    "test"
-                )
+                why = "a joint fit accepts no [priors]; leave them out of the TOML of the test"
+                raise InputError(f"{path}: {why}")
             options.problem(test, study.model)
-            same = (one for _, one, other in found if other.data_sha256 == test.data_sha256)
-            if (twin := next(same, None)) is not None:
-                raise InputError(
-                    f"{path}: its rows are those of {twin.name}; leave one of them out"
-                )
+            for _, twin, other in found:
+                if other.data_sha256 == test.data_sha256:
+                    why = f"its rows are those of {twin.name}; leave one of them out"
+                    raise InputError(f"{path}: {why}")
             found.append((name, path, test))
         except (InputError, SimulationError) as error:
             refused[str(path)] = str(error)
     _check_two(study, len(found), refused)
     tests, every = list[_Test](), _params(study, [test for _, _, test in found])
     for (name, path, test), params in zip(found, every, strict=True):
-        problem = options.problem(test, study.model, params)
-        tests.append(_Test(name, path, problem, params, loading_rate(test)))
+        tests.append(
+            _Test(name, path, options.problem(test, study.model, params), loading_rate(test))
+        )
     return tests, refused
 
 
@@ -262,7 +259,7 @@ def _own_fits(
 
 def _own_fit(test: _Test, model: str, options: Options, near: tuple[Array, ...]) -> _Test:
     """Fit one test, starting from the points `near` it or else by a search."""
-    measurement, params = test.problem.measurement, test.params
+    measurement, params = test.problem.measurement, test.problem.told()
     if not near:
         found = identify(measurement, model, params, options, lambda *_: None)
         return test.fitted(found.problem, found.tracker, found.best().values)

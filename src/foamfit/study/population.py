@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Mask
 from foamfit.data.measurement import Specimen
 from foamfit.errors import InputError
 from foamfit.fitting.box import is_logarithmic
@@ -167,7 +167,7 @@ class Population:
         _, at, places = np.intersect1d(names, self.source.changing, return_indices=True)
         out[np.ix_(at, at)] = self.source.together[np.ix_(places, places)]
         # For own parameters with a trend, or missing in the result, from their deviations.
-        if own.slopes.any() or not set(own.names) <= set(self.source.changing):
+        if own.trend.any() or not set(own.names) <= set(self.source.changing):
             _, at, places = np.intersect1d(names, own.names, return_indices=True)
             among_own = correlation(own.deviations, np.zeros((places.size, places.size)))
             out[np.ix_(at, at)] = among_own[np.ix_(places, places)]
@@ -183,7 +183,7 @@ class Population:
         """Own parameters of the tests, as logarithms where `_in_logarithms` holds."""
         names = tuple(name for name in self.scattering if self._parameters[name].kind == "own")
         if not names:
-            return _Own((), np.empty(0), np.empty(0), np.empty((0, 0)), np.empty(0))
+            return _Own((), np.empty(0), np.empty(0, dtype=bool), np.empty((0, 0)), np.empty(0))
         if len({tuple(self._parameters[name].tests or ()) for name in names}) > 1:
             why = f"{self.source.where}: all own parameters must have values for the same tests"
             raise InputError(why)
@@ -192,30 +192,25 @@ class Population:
         values[:, logs] = np.log(values[:, logs])
         n, k = values.shape
         mean, deviations = values.mean(axis=0), values - values.mean(axis=0)
-        slopes, leverage = np.zeros(k), np.full(k, 1.0 / n)
+        trend, leverage = np.zeros(k, dtype=bool), np.full(k, 1.0 / n)
         tests = self._parameters[names[0]].tests or {}
         rates = [rate for test in tests if (rate := self.source.rate_of.get(test))]
-        if self.rate is not None and len(rates) == n >= FEWEST_OF_TREND:
-            x = np.log(rates)
-            at, x = math.log(self.rate) - x.mean(), x - x.mean()
-            square = float(x @ x)
-            line = x @ deviations / max(square, 1e-300)
-            about = deviations - np.outer(x, line)
+        x = np.log(rates) - math.log(self.rate or 1.0)
+        if self.rate and len(rates) == n >= FEWEST_OF_TREND and np.std(x) > SAME_RATE:
+            slope, there = np.polyfit(x, values, 1)
+            about = values - there - np.outer(x, slope)
             squares = np.maximum([np.sum(deviations**2, axis=0), np.sum(about**2, axis=0)], 1e-300)
-            gain = n * np.log(squares[0] / squares[1]) - math.log(n)
-            trend = (gain > EVIDENCE) & (square > n * SAME_RATE**2)
-            slopes = np.where(trend, line, 0.0)
-            mean, deviations = mean + slopes * at, np.where(trend, about, deviations)
-            leverage = leverage + np.where(trend, at**2 / max(square, 1e-300), 0.0)
-        freedom = max(n - 1 - bool(np.any(slopes)), 1)
+            trend = n * np.log(squares[0] / squares[1]) - math.log(n) > EVIDENCE
+            mean, deviations = np.where(trend, there, mean), np.where(trend, about, deviations)
+            leverage = leverage + trend * x.mean() ** 2 / (n * np.var(x))
+        freedom = max(n - 1 - bool(trend.any()), 1)
         spread = np.sqrt((1.0 + leverage) * np.sum(deviations**2, axis=0) / freedom)
-        return _Own(names, mean, slopes, deviations, spread)
+        return _Own(names, mean, trend, deviations, spread)
 
     @property
     def trends(self) -> list[str]:
         """Own parameters that have a trend with the rate."""
-        pairs = zip(self._own.names, self._own.slopes, strict=True)
-        return [name for name, slope in pairs if slope]
+        return [name for name, x in zip(self._own.names, self._own.trend, strict=True) if x]
 
     def _in_logarithms(self, name: str) -> bool:
         return is_logarithmic(split_name(name)[1]) and min(self._tests(name)) > 0.0
@@ -252,7 +247,7 @@ class Population:
         """
         rng, other = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
         scatter, uncertain = _root(self._correlation), _root(self.covariance)
-        own, freedom = self._own, max(self.fewest - 1 - bool(self._own.slopes.any()), 1)
+        own, freedom = self._own, max(self.fewest - 1 - bool(self._own.trend.any()), 1)
         while True:
             tail = math.sqrt(freedom / rng.chisquare(freedom))
             drawn = tail * (scatter @ rng.standard_normal(len(self.scattering)))
@@ -297,7 +292,7 @@ class _Own(NamedTuple):
 
     names: tuple[str, ...]
     mean: Array  # (k,): at the rate of the test that is predicted
-    slopes: Array  # (k,): by the logarithm of the rate; 0 without evidence for a trend
+    trend: Mask  # (k,): whether there is evidence for a trend
     deviations: Array  # (n, k): of the tests from the means
     spread: Array  # (k,): standard deviation of a new specimen from the mean, as estimated
 
