@@ -18,39 +18,22 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from foamfit.api import FitResult
 from foamfit.arrays import Array, Mask
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import Space
-from foamfit.fitting.branches import unreached
 from foamfit.fitting.links import Links
 from foamfit.fitting.minima import in_order, joint_minima
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Layout, Together, fit_linked
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study import gain
-from foamfit.study.gain import Known
+from foamfit.study.gain import OF_DRAWS, Known, Test
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
-from foamfit.trust.ranges import ALIKE, tolerance
+from foamfit.trust.ranges import ALIKE
 
 TRIES = 60  # attempts per draw
 FROM = 3  # number of minima from which springs with fewer branches are sought
-
-
-@dataclass(frozen=True, eq=False)
-class Test:
-    """A test at hand: its problem and parameters, its result if it was measured, and its study."""
-
-    problem: Problem
-    values: Array
-    fit: FitResult | None = None
-    study: str = ""  # name of the joint fit that it belongs to
-
-    def with_springs(self, drawn: Array) -> Array:
-        """Return its parameters with drawn springs."""
-        count = len(self.problem.model.names)
-        return np.append(drawn[:count], self.values[count:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,69 +41,68 @@ class Explanation:
     """Parameters of the tests at hand that explain them; the rest is as in `Known`."""
 
     vectors: tuple[Array, ...]  # of each test
+    sizes: Array  # (k,)
     bread: Array  # (k, k)
     meat: Array  # (k, k)
     reached: Mask  # (k,)
 
 
-def known_of(tests: Sequence[Test], rng: np.random.Generator, draws: int) -> Known:
-    """Return what some tests of one foam say about the parameters of its springs."""
-    first = tests[0].problem
+def known_of(
+    tests: Sequence[Test], rng: np.random.Generator, draws: int, informed: int | None = None
+) -> Known:
+    """Return what some tests of one foam say about the parameters of its springs.
+
+    The information is computed in the first `informed` draws, by default in all. Without draws
+    only the best point is known.
+    """
+    first, at_hand = tests[0].problem, [one.values for one in tests]
     names = tuple(name for name in first.free() if name not in NUISANCE)
-    k, sizes = len(names), first.sizes(names, tests[0].values)
     missed, share, roots = _of_fits(tests, names)
 
-    def said(t: int, values: Array) -> tuple[Array, Array]:
-        rows = gain.rows_of(tests[t].problem, values, names, sizes)
-        return gain.information(gain.without_nuisance(rows, k), roots[t])
+    def explained(vectors: Sequence[Array]) -> Explanation:
+        sizes, (bread, meat) = first.sizes(names, vectors[0]), np.zeros((2, len(names), len(names)))
+        for test, values, root in zip(tests, vectors, roots, strict=True):
+            rows = test.rows(values, names, sizes)
+            # The covariance of a test alone is that of its fit, D (JᵀJ)⁻¹ D.
+            alone = np.linalg.pinv(own := rows.T @ rows, rcond=1e-12, hermitian=True)
+            bread, meat = bread + own, meat + own @ (alone * np.outer(root, root)) @ own
+        return Explanation(tuple(vectors), sizes, bread, meat, _reached(tests, vectors, names))
 
-    def explained(vectors: Sequence[Array], reached: Mask | None = None) -> Explanation:
-        found = [said(t, values) for t, values in enumerate(vectors)]
-        bread, meat = (np.sum(each, axis=0) for each in zip(*found, strict=True))
-        reached = _reached(tests, vectors, names) if reached is None else reached
-        return Explanation(tuple(vectors), bread, meat, reached)
+    def known(drawn: Sequence[Explanation], informed: int | None = None) -> Known:
+        kept: Any = {n: np.array([getattr(one, n) for one in drawn[:informed]]) for n in OF_DRAWS}
+        springs = np.array([one.vectors[0] for one in drawn])
+        return Known(first, names, springs, missed=missed, share=share, stretch=stretch, **kept)
 
-    own = [one.values for one in tests]
-    values = _mean_of(tests, names, sizes, np.array([said(t, x)[0] for t, x in enumerate(own)]))
-    best = explained(own)
-    known = Known(
-        first, values, names, sizes, best.bread[None], best.meat[None], missed, share, np.ones(k),
-        best.reached[None], values[None],
-    )  # fmt: skip
-    known = replace(known, stretch=_stretch(known, tests))
+    problems, links = [one.problem for one in tests], Links(dict.fromkeys(names, "shared"))
+    starts = Together.of_own_fits(problems, at_hand).starts(len(tests))
+    vectors = at_hand if len(tests) == 1 else fit_linked(problems, links, starts).values
+    best, stretch = explained(vectors), np.ones(len(names))
+    stretch = _stretch(known([best]), tests)
     if not draws:
-        return known
+        return known([best])
     every = list[Explanation]()
     if first.model.has_several and any(one.fit for one in tests):
-        for found in _explanations(tests, names):
+        for found in _explanations(tests, vectors, names):
             with suppress(SimulationError):  # it was found with less accuracy
                 every.append(explained(found.values))
-    several, mean = bool(every), tuple(one.with_springs(values) for one in tests)
-    every = every or [replace(best, vectors=mean)]
-    drawn, weights = _draws(known, tests, every, rng, draws)
-    for i, one in enumerate(drawn):
+    drawn, weights = _draws(known([best]), tests, every or [best], rng, draws)
+    for i, one in enumerate(drawn[:informed]):
         with suppress(SimulationError):  # a coarser simulation had followed the test
-            vectors = [test.with_springs(one.vectors[0]) for test in tests]
-            drawn[i] = explained(vectors, None if several else one.reached)
-    kept: dict[str, Any] = {"draws": np.array([one.vectors[0] for one in drawn])}
-    for name in ("bread", "meat", "reached"):
-        kept[name] = np.array([getattr(one, name) for one in drawn])
-    if several:
-        springs = [one.vectors[0][: len(first.model.names)] for one in every]
-        kept["explained"] = np.array(springs)[np.argsort(-weights)]
-    return replace(known, **kept)
+            drawn[i] = explained([test.with_springs(one.vectors[0]) for test in tests])
+    others = tuple(every[i].vectors[0] for i in np.argsort(-weights)) if every else ()
+    return replace(known(drawn, informed), explained=others)
 
 
 def _reached(tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[str]) -> Mask:
     """Return whether a test has reached the branch of each parameter, (k,)."""
-    out = np.zeros(len(names), dtype=bool)
-    for one, values in zip(tests, vectors, strict=True):
-        never = unreached(one.problem, one.problem.objective.simulate(values, everything=True))
-        out |= np.array([name not in never for name in names])
-    return out
+    pairs = [(one, one.problem.objective, x) for one, x in zip(tests, vectors, strict=True)]
+    each = [one.reached(does.simulate(x, everything=True), names) for one, does, x in pairs]
+    return np.asarray(np.any(each, axis=0))
 
 
-def _explanations(tests: Sequence[Test], names: Sequence[str]) -> list[Together]:
+def _explanations(
+    tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[str]
+) -> list[Together]:
     """Return springs in series that explain the tests at hand.
 
     They are the minima that noise could make the best, best first, and the best springs of which
@@ -130,7 +112,7 @@ def _explanations(tests: Sequence[Test], names: Sequence[str]) -> list[Together]
     problems, model = tuple(one.problem for one in tests), tests[0].problem.model
     links, top = Links(dict.fromkeys(names, "shared")), max(one.scales.stress for one in problems)
     layout = Layout.of(problems, links)
-    minima = joint_minima(layout.fitted(layout.start([one.values for one in tests])))
+    minima = joint_minima(layout.fitted(layout.start(vectors)))
     simpler = dict[tuple[int, ...], Together]()
     for found in minima[:FROM]:
         own = [model.own(i, found.values[0]) for i in range(len(model.laws))]
@@ -156,35 +138,22 @@ def _held(tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[str])
     return out
 
 
-def _of_fits(tests: Sequence[Test], names: Sequence[str]) -> tuple[float, dict[str, float], Array]:
-    """Return `missed` and `share` of `Known`, and what `information` needs of each fit.
+def _of_fits(tests: Sequence[Test], names: Sequence[str]) -> tuple[float, float, Array]:
+    """Return `missed` and `share` of `Known`, and standard errors of each fit over those of JᵀJ.
 
     A simulated test has neither noise nor model error.
     """
-    missed, share, roots = 0.0, dict[str, list[float]](), np.ones((len(tests), len(names)))
+    missed, whole, roots = 0.0, 1e-300, np.ones((len(tests), len(names)))
     for t, one in enumerate(tests):
         best, objective = BestPoint(one.problem, one.values), one.problem.objective
         if one.fit is None:
             continue
-        missed += tolerance(best) / (ALIKE**2 - 1.0)
-        for curve, error in zip(objective.counted, best.errors, strict=True):
-            share.setdefault(curve, []).append(error.law / max(objective.span(curve), 1e-300))
+        for curve, n, error in zip(objective.counted, objective.sizes, best.errors, strict=True):
+            missed, whole = missed + n * error.law**2, whole + n * objective.span(curve) ** 2
         for name, found in zip(best.names, best.spread.inflation.tolist(), strict=True):
             if name in names and math.isfinite(found):
                 roots[t, names.index(name)] = math.sqrt(found)
-    return missed, {curve: float(np.mean(each)) for curve, each in share.items()}, roots
-
-
-def _mean_of(tests: Sequence[Test], names: Sequence[str], sizes: Array, breads: Array) -> Array:
-    """Return the mean parameters of the tests, weighted by the information in each."""
-    first = tests[0].problem
-    values, places = tests[0].values, [first.index[name] for name in names]
-    if len(tests) == 1:
-        return values
-    pull = [b @ (one.values[places] / sizes) for b, one in zip(breads, tests, strict=True)]
-    values = values.copy()
-    values[places] = sizes * (np.linalg.pinv(breads.sum(axis=0), rcond=1e-10) @ sum(pull))
-    return first.space().decode(first.space().encode(values))
+    return missed, math.sqrt(missed / whole), roots
 
 
 def _stretch(known: Known, tests: Sequence[Test]) -> Array:
@@ -194,7 +163,7 @@ def _stretch(known: Known, tests: Sequence[Test]) -> Array:
     for fit in (one.fit for one in tests if one.fit is not None):
         for i, name in enumerate(known.names):
             if (found := fit.parameters[name].range) is not None and law[i] > 0.0:
-                half = 0.5 * (found[1] - found[0]) / known.sizes[i]
+                half = 0.5 * (found[1] - found[0]) / known.sizes[0, i]
                 out[i] = max(out[i], half / law[i])
     return out
 
@@ -224,8 +193,9 @@ def _draws(
         own = [(objective, np.append(springs, x[n_springs:])) for objective, x in pairs]
         return sum(float(np.sum(objective.residual(x) ** 2)) for objective, x in own)
 
-    noise = float(np.max(np.diag(known.meat[0]) / np.maximum(np.diag(known.bread[0]), 1e-300)))
-    noise, marks, steps = max(noise, 1.0), list[float](), list[tuple[Array, Array]]()
+    bread, meat = np.diag(known.bread[0]), np.diag(known.meat[0])
+    noise = max(float(np.max(meat / np.maximum(bread, 1e-300))), 1.0)
+    marks, steps = list[float](), list[tuple[Array, Array]]()
     costs = [cost(one, one.vectors[0]) for one in every]
     for one, least in zip(every, costs, strict=True):
         inverse = np.linalg.inv(one.bread + prior)
@@ -233,7 +203,7 @@ def _draws(
         power, axes = np.linalg.eigh(spread)
         axes = np.where(one.reached[:, None], axes * np.sqrt(np.maximum(power, 0.0)), 0.0)
         best = space.encode(one.vectors[0])  # steps are taken in the coordinates of the search
-        slopes = space.slopes(best, one.vectors[0])[at] / known.sizes[:, None]
+        slopes = space.slopes(best, one.vectors[0])[at] / one.sizes[:, None]
         steps.append((best, np.linalg.lstsq(slopes, axes, rcond=1e-12)[0]))
         volume = np.linalg.slogdet(np.eye(best.size) + slopes.T @ one.bread @ slopes)[1]
         marks.append(-0.5 * (least / noise + volume))

@@ -10,18 +10,21 @@ factor by which the ranges of the tests at hand exceed this.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import linalg
 
+from foamfit.api import FitResult
 from foamfit.arrays import Array, Mask
 from foamfit.data.rig import Candidate, Rig
 from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.branches import unreached
+from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.report.studies.plan import Expected
 from foamfit.solve.simulation import simulate
@@ -37,57 +40,130 @@ TINY, ROUNDING = 1e-6, 1e-12  # least information on a scaled parameter, and ove
 LONGEST = 30.0  # longest contact, in times that the striker takes over the height of the specimen
 TIMED = 20  # number of draws from which the duration of an impact is taken
 UNKNOWN = 2.0 * NOTHING  # half an interval where a branch is not reached, in scales
+OF_DRAWS = ("sizes", "bread", "meat", "reached")  # arrays of `Known`
 # Quantities of `Target`; the absorbed energy is that up to the largest strain.
 UNITS = {"peak_force": "N", "absorbed_energy": "J", "dissipated_energy": "J", "peak_strain": ""}
+
+
+@dataclass(frozen=True, eq=False)
+class Test:
+    """A test at hand or a candidate: its problem and parameters, and the weight of its samples.
+
+    A measured test has its result, and the name of the joint fit that it belongs to.
+    """
+
+    problem: Problem
+    values: Array
+    fit: FitResult | None = None
+    study: str = ""
+    weight: float = 1.0  # samples that the rig records per simulated sample
+
+    def with_springs(self, drawn: Array) -> Array:
+        """Return its parameters with drawn springs."""
+        count = len(self.problem.model.names)
+        return np.append(drawn[:count], self.values[count:])
+
+    @property
+    def roots(self) -> Array:
+        """Roots of the weights of its residuals, (n,); priors have none."""
+        objective = self.problem.objective
+        return np.repeat([self.weight**0.5, 1.0], [objective.n_data, len(objective.priors)])
+
+    def rows(self, values: Array, names: tuple[str, ...], sizes: Array, *more: Array) -> Array:
+        """Return slopes of the residuals by scaled parameters, and `more` columns, (n, k + …).
+
+        The part along the slopes by nuisance parameters is taken off (Frisch & Waugh 1933,
+        Econometrica 1, 387).
+        """
+        problem = self.problem
+        own = tuple(name for name in problem.free() if name in NUISANCE)
+        scales = np.append(problem.sizes(own, values), sizes)
+        rows = np.column_stack((problem.slopes(values, (*own, *names)) * scales, *more))
+        rows *= self.roots[:, None]
+        others, rows = np.linalg.qr(rows[:, : len(own)])[0], rows[:, len(own) :]
+        return np.asarray(rows - others @ (others.T @ rows))
+
+    def reached(self, shown: Simulated, names: Sequence[str]) -> Mask:
+        """Return whether the branch of each parameter was reached in a simulation, (k,)."""
+        never = unreached(self.problem, shown)
+        return np.array([name not in never for name in names], dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
     """What the tests at hand say about the k varied parameters of the springs.
 
-    Parameters are scaled by `sizes` (k,). `draws` (d, n) are vectors of parameters that follow the
-    tests about equally well, `bread` (d, k, k) is JᵀJ there and `meat` JᵀΣJ: slopes in a draw may
-    differ much from those of the fit. `missed` is the sum of squares of the model error, `share`
-    its RMS over the range of each curve, `stretch` (k,) the ranges of the fits over those to first
-    order, at least 1, `reached` (d, k) whether the branch of each parameter was reached.
-    `explained` (m, n) are springs in series that explain the tests in other ways, see `draws`.
+    `drawn` (m, n) are vectors of parameters that follow the tests about equally well. In the first
+    d of them parameters are scaled by `sizes` (d, k), `bread` (d, k, k) is JᵀJ and `meat` JᵀΣJ, as
+    slopes may differ much from those of the fit, `reached` (d, k) is whether the branch of each
+    parameter was reached, and `others` are springs in series that give nearly the same records; the
+    rest only tell how probably a limit of the rig is exceeded. `missed` is the sum of squares of
+    the model error, `share` its RMS over the ranges of the curves, `stretch` (k,) the ranges of the
+    fits over those to first order, at least 1. `explained` are vectors with springs in series that
+    explain the tests in other ways, see `draws`.
     """
 
     problem: Problem
-    values: Array
     names: tuple[str, ...]
+    drawn: Array
     sizes: Array
     bread: Array
     meat: Array
-    missed: float
-    share: dict[str, float]
-    stretch: Array
     reached: Mask
-    draws: Array
-    explained: Array | None = None
+    missed: float
+    share: float
+    stretch: Array
+    explained: tuple[Array, ...] = ()
+    others: tuple[tuple[Other, ...], ...] = ()
 
-    @cached_property
-    def drawn_sizes(self) -> Array:
-        """Scale of each parameter in each draw over `sizes`, (d, k)."""
-        return np.array([self.problem.sizes(self.names, one) for one in self.draws]) / self.sizes
+    @property
+    def draws(self) -> Array:
+        """The draws in which the information is known, (d, n)."""
+        return self.drawn[: len(self.bread)]
+
+    def first(self, count: int) -> Known:
+        """Return the same with the first draws only, and without other springs."""
+        own: Any = {name: getattr(self, name)[:count] for name in ("drawn", *OF_DRAWS)}
+        return replace(self, others=(), **own)
 
     @property
     def places(self) -> list[int]:
         """Places of the parameters in a vector of all."""
         return [self.problem.index[name] for name in self.names]
 
-    def with_springs(self, drawn: Array, problem: Problem) -> Array:
-        """Return the parameters of another test: drawn springs, and its nuisance parameters."""
-        count = len(self.problem.model.names)
-        return np.append(drawn[:count], problem.vector()[count:])
+    @property
+    def best(self) -> Other:
+        """The first draw, with what the tests at hand tell about it."""
+        return Other(self.drawn[0], np.pad(self.bread[0], (0, 1)), self.reached[0])
 
 
-class Refit(NamedTuple):
-    """Other springs fitted to the records of a drawn foam; see `others`."""
+class Other(NamedTuple):
+    """Other springs, and what some tests show of their difference from a drawn foam.
 
-    values: Array  # (k,), scaled
-    rise: float  # of the sum of squares
+    `inner` (k + 1, k + 1) has the products of the slopes by scaled parameters, and of the
+    differences of the residuals as a last column, without nuisance parameters; NaN if a test cannot
+    be simulated. The products of several tests add up.
+    """
+
+    springs: Array
+    inner: Array
     reached: Mask  # (k,)
+
+    @classmethod
+    def together(cls, seen: Sequence[Other]) -> Other:
+        """Return what several tests show."""
+        springs, inner, reached = zip(*seen, strict=True)
+        return cls(springs[0], np.sum(inner, axis=0), np.asarray(np.any(reached, axis=0)))
+
+    def refit(self, known: Known, sizes: Array) -> tuple[Array, float]:
+        """Return the parameters (k,), scaled, after a fit, and the rise of the sum of squares.
+
+        Both are to first order; the steps are small against the scales `sizes` (k,).
+        """
+        bread, gradient = self.inner[:-1, :-1], self.inner[:-1, -1]
+        step = np.linalg.solve(bread + np.eye(gradient.size) / NOTHING**2, gradient)
+        rise = max(float(self.inner[-1, -1] - gradient @ step), 0.0)
+        return self.springs[known.places] / sizes - step, rise
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,46 +173,32 @@ class Seen:
     bread: Array  # (d, k, k)
     meat: Array  # (d, k, k)
     reached: Mask  # (d, k)
-    broken: Mask  # (d,): whether a limit was exceeded
+    broken: Mask  # (m,): whether a limit was exceeded
     missed: Array  # (d,): sum of squares of the model error
     force: float  # median of the largest force, N
     apart: dict[str, float] = field(default_factory=dict)  # χ² by which it excludes each rival
-    others: tuple[tuple[Refit, ...], ...] = ()  # that follow the records of each draw as well
+    others: tuple[tuple[Other, ...], ...] = ()  # as in `Known`, in this test
 
 
-def rows_of(problem: Problem, values: Array, names: tuple[str, ...], sizes: Array) -> Array:
-    """Return slopes by the nuisance parameters, then by scaled parameters, (n, q + k)."""
-    own = tuple(name for name in problem.free() if name in NUISANCE)
-    return problem.slopes(values, (*own, *names)) * np.append(problem.sizes(own, values), sizes)
+def difference(known: Known, springs: Array, sizes: Array, test: Test, residual: Array) -> Other:
+    """Return what a test shows of the difference of springs from a foam with a residual."""
+    objective, values = test.problem.objective, test.with_springs(springs)
+    try:
+        shown = objective.simulate(values, everything=True)
+    except SimulationError:
+        k = len(known.names)
+        return Other(springs, np.full((k + 1, k + 1), math.nan), np.zeros(k, dtype=bool))
+    apart = objective.compare(shown, values)
+    # A rival of fewer springs shows the motion of fewer masses.
+    n = min(objective.n_data, residual.size - len(objective.priors))
+    apart[:n] -= residual[:n]
+    apart[n:] = 0.0
+    rows = test.rows(values, known.names, sizes, apart)
+    return Other(springs, rows.T @ rows, test.reached(shown, known.names))
 
 
-def without_nuisance(rows: Array, k: int) -> Array:
-    """Return the last k columns without their part along the others (Frisch & Waugh 1933)."""
-    others = np.linalg.qr(rows[:, :-k])[0]
-    return np.asarray(rows[:, -k:] - others @ (others.T @ rows[:, -k:]))
-
-
-def roots_of(problem: Problem, weight: float) -> Array:
-    """Return the factors of residuals whose samples have some weight; priors have none."""
-    objective = problem.objective
-    return np.repeat([weight**0.5, 1.0], [objective.n_data, len(objective.priors)])
-
-
-def information(rows: Array, root: Array) -> tuple[Array, Array]:
-    """Return JᵀJ and JᵀΣJ (k, k) of a test without nuisance parameters.
-
-    `root` (k,) are the standard errors of its fit over those of JᵀJ, so that the covariance of this
-    test alone is that of its fit, D (JᵀJ)⁻¹ D.
-    """
-    bread = rows.T @ rows
-    alone = np.linalg.pinv(bread, rcond=1e-12, hermitian=True) * np.outer(root, root)
-    return bread, bread @ alone @ bread
-
-
-def problem_for(
-    known: Known, candidate: Candidate, rig: Rig, *, with_motion: bool = False
-) -> Problem:
-    """Return the problem of a candidate with the law of the tests at hand.
+def as_test(known: Known, candidate: Candidate, rig: Rig, *, with_motion: bool = False) -> Test:
+    """Return a candidate with the law of the tests at hand.
 
     With `with_motion` the motion counts even if the rig does not record it.
     """
@@ -151,7 +213,9 @@ def problem_for(
     for name, one in problem.params.items():
         if one.expr:
             params[name].expr = one.expr
-    return make_problem(record, law, candidate.drive, params, None, inside, relaxation=terms)
+    made = make_problem(record, law, candidate.drive, params, None, inside, relaxation=terms)
+    weight = candidate.weight(made.objective.time, test, rig)
+    return Test(made, made.vector(), weight=weight)
 
 
 def _duration_and_peak(known: Known, candidate: Candidate, usual: float) -> tuple[float, float]:
@@ -173,79 +237,44 @@ def _duration_and_peak(known: Known, candidate: Candidate, usual: float) -> tupl
 
 
 def look(
-    known: Known, candidate: Candidate, rig: Rig, rivals: Mapping[str, Known] | None = None
+    known: Known, candidate: Candidate, rig: Rig, rivals: Mapping[str, Known] = MappingProxyType({})
 ) -> Seen:
     """Simulate a candidate for every draw, with exact derivatives."""
-    problem = problem_for(known, candidate, rig)
-    objective, test = problem.objective, known.problem.measurement
-    each, counted = candidate.weight(objective.time, test, rig), objective.counted
-    weigh = roots_of(problem, each)
-    own = [objective.noise(c).sigma * objective.factor(c) for c in counted]
-    noise = np.repeat([*own, objective.unit], [*objective.sizes, len(objective.priors)])
-    k, d = len(known.names), len(known.draws)
+    test, (d, k) = as_test(known, candidate, rig), known.reached.shape
+    objective, specimen = test.problem.objective, known.problem.measurement.specimen
+    own = [objective.noise(c).sigma * objective.factor(c) for c in objective.counted]
+    noise = np.repeat([*own, objective.unit], [*objective.sizes, len(objective.priors)])[:, None]
+    laws = {name: (one, as_test(one, candidate, rig)) for name, one in rivals.items()}
     bread, meat = np.zeros((2, d, k, k))
-    reached, broken = np.zeros((d, k), dtype=bool), np.ones(d, dtype=bool)
+    reached, broken = np.zeros((d, k), dtype=bool), np.ones(len(known.drawn), dtype=bool)
     missed, forces, apart = np.zeros(d), list[float](), dict[str, list[float]]()
-    usual = max(known.share.values(), default=0.0)  # of curves that no test at hand has
-    made = {n: _excess_over(one, candidate, rig, each) for n, one in (rivals or {}).items()}
-    others = {name: excess for name, excess in made.items() if excess is not None}
-    for i, drawn in enumerate(known.draws):
-        values = known.with_springs(drawn, problem)
+    others = [tuple[Other, ...]()] * d
+    for i, values in enumerate(map(test.with_springs, known.drawn)):
         try:
             shown = objective.simulate(values, everything=True)
         except SimulationError:
             continue
-        forces.append(float(shown.motion.base_stress.max()) * test.specimen.area)
-        most = float(shown.motion.displacement[-1].max())
-        limits = rig.force, rig.displacement, rig.largest_strain
-        broken[i] = np.any(np.array([forces[-1], most, most / test.specimen.height]) > limits)
-        if broken[i]:  # no record
+        forces.append(float(shown.motion.base_stress.max()) * specimen.area)
+        farthest = min(rig.displacement, rig.largest_strain * specimen.height)
+        broken[i] = forces[-1] > rig.force or shown.motion.displacement[-1].max() > farthest
+        if broken[i] or i >= d:  # no record
             continue
-        rows = rows_of(problem, values, known.names, known.sizes) * weigh[:, None]
-        rows = without_nuisance(rows, k)
-        bread[i], meat[i] = rows.T @ rows, (noise[:, None] * rows).T @ (noise[:, None] * rows)
-        silent = unreached(problem, shown)
-        reached[i] = [name not in silent for name in known.names]
-        for curve, size in zip(counted, objective.sizes, strict=True):
-            share = known.share.get(curve, usual)
-            off = share * float(np.ptp(shown.curves[curve]))
-            missed[i] += each * size * (off * objective.factor(curve)) ** 2
-        for name, excess in others.items():
-            found = excess(objective.compare(shown, values)) / (1.0 + missed[i])
-            apart.setdefault(name, []).append(found)
+        rows = test.rows(values, known.names, known.sizes[i])
+        bread[i], meat[i] = rows.T @ rows, (noise * rows).T @ (noise * rows)
+        reached[i] = test.reached(shown, known.names)
+        ranges = [np.ptp(shown.curves[c]) * objective.factor(c) for c in objective.counted]
+        missed[i] = test.weight * known.share**2 * (np.square(ranges) @ objective.sizes)
+        residual = objective.compare(shown, values)
+        springs = [one.springs for one in known.others[i]] if known.others else []
+        others[i] = tuple(difference(known, x, known.sizes[i], test, residual) for x in springs)
+        for name, (law, of_law) in laws.items():
+            one = difference(law, law.drawn[0], law.sizes[0], of_law, residual)
+            rise = Other.together((law.best, one)).refit(law, law.sizes[0])[1]
+            apart.setdefault(name, []).append(rise / (1.0 + missed[i]))
     told = {name: float(np.median(found)) for name, found in apart.items()}
+    told = {name: found for name, found in told.items() if math.isfinite(found)}
     force = float(np.median(forces)) if forces else math.nan
-    return Seen(bread, meat, reached, broken, missed, force, told)
-
-
-def _excess_over(
-    known: Known, candidate: Candidate, rig: Rig, weight: float
-) -> Callable[[Array], float] | None:
-    """Return the χ² of residuals that remains after a fit of another law, to first order.
-
-    The law is simulated at its best point for a candidate; None if it cannot be.
-    """
-    k = len(known.names)
-    try:
-        problem = problem_for(known, candidate, rig)
-        values = known.with_springs(known.values, problem)
-        shown = problem.objective.simulate(values)
-    except SimulationError:
-        return None
-    n = problem.objective.n_data
-    rows = math.sqrt(weight) * rows_of(problem, values, known.names, known.sizes)[:n]
-    root = np.linalg.cholesky(known.bread[0] + TINY * np.eye(k)).T
-    rows = np.vstack([rows, np.hstack([np.zeros((k, rows.shape[1] - k)), root])])
-    own = problem.objective.compare(shown, values)[:n]
-
-    def excess(residual: Array) -> float:
-        if residual.size < n:
-            return 0.0
-        apart = np.append(math.sqrt(weight) * (residual[:n] - own), np.zeros(k))
-        left = apart - rows @ np.linalg.lstsq(rows, apart, rcond=1e-10)[0]
-        return float(left @ left)
-
-    return excess
+    return Seen(bread, meat, reached, broken, missed, force, told, tuple(others))
 
 
 def covariance(known: Known, seen: Sequence[Seen], floor: float = TINY) -> tuple[Array, Array]:
@@ -253,19 +282,14 @@ def covariance(known: Known, seen: Sequence[Seen], floor: float = TINY) -> tuple
 
     `floor` is the least information on each parameter over its scale.
     """
-    scale = known.drawn_sizes[:, :, None] * known.drawn_sizes[:, None, :]
-    bread = scale * sum((one.bread for one in seen), known.bread)
-    meat = scale * sum((one.meat for one in seen), known.meat)
-    missed = sum((one.missed for one in seen), np.full(len(known.draws), known.missed))
-    power, axes = np.linalg.eigh(bread)
-    least = np.maximum(power, np.maximum(floor, ROUNDING * power[:, -1:]))
-    inner = np.einsum("dji,djk,dkl->dil", axes, meat, axes)
-    inner += np.eye(power.shape[1]) * np.maximum(least - power, 0.0)[:, :, None]
-    axes = axes / least[:, None, :]
-    noise = np.einsum("dij,djk,dlk->dil", axes, inner, axes) * scale
-    law = np.einsum("dij,dj,dkj->dik", axes, least, axes) * scale
-    law = law * np.outer(known.stretch, known.stretch)
-    return noise, (ALIKE**2 - 1.0) * missed[:, None, None] * law
+    bread = known.bread + sum(one.bread for one in seen)
+    meat = known.meat + sum(one.meat for one in seen)
+    missed = known.missed + sum(one.missed for one in seen) * np.ones(len(bread))
+    least = np.maximum(floor, ROUNDING * np.trace(bread, axis1=1, axis2=2))
+    prior = least[:, None, None] * np.eye(len(known.names))
+    inverse = np.linalg.inv(bread + prior)
+    law = (ALIKE**2 - 1.0) * missed[:, None, None] * inverse
+    return inverse @ (meat + prior) @ inverse, law * np.outer(known.stretch, known.stretch)
 
 
 def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
@@ -277,16 +301,14 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
     halves, ranges = (np.sqrt(np.maximum(one, 0.0)) for one in (NORMAL**2 * noise, law))
     wider, values = np.maximum(halves, ranges), known.draws[:, known.places] / known.sizes
     clear, limits = np.abs(values) > wider, [known.problem.params[n] for n in known.names]
-    least, most = np.array([(one.min, one.max) for one in limits]).T / known.sizes
+    least, most = np.array([(one.min, one.max) for one in limits]).T
     # As in a fit, an interval ends at the limits of its parameter.
     low, high, elsewhere = _with_others(known, seen, values, halves)
-    widths = np.minimum(high, most) - np.maximum(low, least)
-    shares = 0.5 * (high - low) / known.drawn_sizes
-    wide = np.maximum(wider / known.drawn_sizes, shares)  # and, to one side, another minimum
-    side = np.maximum(wide, np.maximum(high - values, values - low) / known.drawn_sizes)
-    reached = np.broadcast_to(known.reached, halves.shape)
-    for one in seen:
-        reached = reached | one.reached
+    widths = np.minimum(high * known.sizes, most) - np.maximum(low * known.sizes, least)
+    shares = 0.5 * (high - low)
+    wide = np.maximum(wider, shares)  # and, to one side, another minimum
+    side = np.maximum(wide, np.maximum(high - values, values - low))
+    reached = np.any([known.reached, *(one.reached for one in seen)], axis=0)
     out = dict[str, Expected]()
     for i, name in enumerate(known.names):
         shown = reached[:, i]
@@ -296,7 +318,7 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
         state = "determined" if chance >= 0.5 else "weak" if some >= 0.5 else "not determined"
         ends, share = np.full(3, math.nan), math.nan
         if state != "not determined":
-            ends = known.sizes[i] * np.quantile(widths[shown, i], (0.1, 0.5, 0.9))
+            ends = np.quantile(widths[shown, i], (0.1, 0.5, 0.9))
             share = float(np.median(shares[shown, i]))
         low, middle, high = ends.tolist()
         out[name] = Expected(middle, state, (low, high), chance, share)
@@ -309,25 +331,24 @@ def _with_others(
     """Return the ends of intervals, and whether values far outside fit almost as well, (d, k).
 
     The rule is that of a joint fit (`joint_fit`); intervals extend to other springs that noise
-    could make the best. Of several tests, the one that these follow least counts.
+    could make the best.
     """
     low, high, elsewhere = values - halves, values + halves, np.zeros(values.shape, dtype=bool)
-    shown = [one for one in seen if one.others]
-    for i in range(len(values)) if shown else ():
-        meat = known.meat[i] + sum(one.meat[i] for one in shown)
-        noise = np.trace(meat) / np.trace(known.bread[i] + sum(one.bread[i] for one in shown))
-        followed = zip(*(one.others[i] for one in shown if one.others[i]), strict=True)
-        worst = [max(each, key=lambda x: x.rise) for each in followed]
-        near = [(x, x.rise / (NORMAL**2 * noise)) for x in worst]
-        for other, rise in near:
-            if rise < 1.0:
+    for i, others in enumerate(known.others):
+        meat = known.meat[i] + sum(one.meat[i] for one in seen)
+        noise = np.trace(meat) / np.trace(known.bread[i] + sum(one.bread[i] for one in seen))
+        near = list[Array]()
+        for each in zip(others, *(one.others[i] for one in seen if one.others[i]), strict=True):
+            other = Other.together(each)
+            there, rise = other.refit(known, known.sizes[i])
+            if (rise := rise / (NORMAL**2 * noise)) < 1.0:
                 half = np.where(other.reached, halves[i] * math.sqrt(1.0 - rise), UNKNOWN)
-                low[i] = np.minimum(low[i], other.values - half)
-                high[i] = np.maximum(high[i], other.values + half)
-        for other, rise in near:
-            if rise <= HARDLY_WORSE**2:
-                apart = np.maximum(low[i] - other.values, other.values - high[i])
-                elsewhere[i] |= apart > FAR * (high[i] - low[i])
+                low[i] = np.minimum(low[i], there - half)
+                high[i] = np.maximum(high[i], there + half)
+            near += [there] if rise <= HARDLY_WORSE**2 else []
+        for there in near:
+            apart = np.maximum(low[i] - there, there - high[i])
+            elsewhere[i] |= apart > FAR * (high[i] - low[i])
     return low, high, elsewhere
 
 
@@ -354,36 +375,33 @@ class Target:
         mass = (striker and striker.mass) or (rig.masses[0] if rig.masses else None)
         if mass is None or velocity <= 0.0:
             raise InputError(f"quantity {text!r} needs a striker; give its mass in the rig")
-        problem = problem_for(known, Candidate("impact", mass, velocity), rig, with_motion=True)
-        found = [cls._in_draw(name, known, problem, drawn) for drawn in known.draws]
+        asked = as_test(known, Candidate("impact", mass, velocity), rig, with_motion=True)
+        found = [cls._in_draw(name, known, asked, drawn) for drawn in known.draws]
         values, slopes = zip(*found, strict=True)
         return cls(text, UNITS[name], np.array(values), np.array(slopes))
 
     @staticmethod
-    def _in_draw(name: str, known: Known, problem: Problem, drawn: Array) -> tuple[float, Array]:
+    def _in_draw(name: str, known: Known, asked: Test, drawn: Array) -> tuple[float, Array]:
         """Return the quantity in a draw, SI, and its slopes."""
-        objective, specimen = problem.objective, problem.measurement.specimen
-        values = known.with_springs(drawn, problem)
+        problem, values = asked.problem, asked.with_springs(drawn)
+        specimen, sizes = problem.measurement.specimen, known.problem.sizes(known.names, drawn)
+        moves = problem.moves(values, known.names) * sizes
+        places = np.flatnonzero(moves.any(axis=1))
         try:
-            curves = objective.simulate(values, everything=True).curves
+            rows = problem.objective.simulate(values, everything=True, places=places).rows
         except SimulationError:
             return math.nan, np.full(len(known.names), math.nan)
-        parts = objective.by_curve(problem.slopes(values, known.names) * known.sizes)
-        by = {curve: part.T / objective.factor(curve) for curve, part in parts.items()}
-        stress, moved = curves["stress_time"], curves["displacement_time"]
-        by_stress, by_motion = by["stress_time"], by["displacement_time"]
-        if name == "peak_force":
-            at = int(np.argmax(stress))
-            return float(stress[at]) * specimen.area, by_stress[:, at] * specimen.area
-        if name == "peak_strain":
-            at = int(np.argmax(moved))
-            return float(moved[at]) / specimen.height, by_motion[:, at] / specimen.height
-        end = int(np.argmax(moved)) + 1 if name == "absorbed_energy" else moved.size
-        stress, moved, by_stress = stress[:end], moved[:end], by_stress[:, :end]
-        middle = 0.5 * (stress[1:] + stress[:-1]) * specimen.area
-        slopes = np.trapezoid(by_stress, moved, axis=1) * specimen.area
-        slopes += np.diff(by_motion[:, :end], axis=1) @ middle
-        return float(middle @ np.diff(moved)), slopes
+        through = linalg.block_diag(np.eye(1), moves[places].T)  # the curve, then its slopes
+        force = specimen.area * (through @ rows["stress_time"])
+        moved = through @ rows["displacement_time"]
+        if name in ("peak_force", "peak_strain"):
+            curve = force if name == "peak_force" else moved / specimen.height
+            found = curve[:, np.argmax(curve[0])]
+            return float(found[0]), found[1:]
+        end = int(np.argmax(moved[0])) + 1 if name == "absorbed_energy" else len(moved[0])
+        force, moved = force[:, :end], moved[:, :end]
+        found = np.trapezoid(force, moved[0]) + np.trapezoid(force[0], moved)
+        return float(0.5 * found[0]), np.asarray(found[1:])
 
     def error(self, known: Known, seen: Sequence[Seen]) -> float:
         """Return the standard error of the quantity after some tests, RMS of the draws, over it."""

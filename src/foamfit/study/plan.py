@@ -8,20 +8,22 @@ simulated with each draw, and the expected interval of a parameter is the median
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from itertools import combinations
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import optimize
 
 from foamfit.api import FitResult
 from foamfit.arrays import Array, single_threaded
 from foamfit.data.measurement import MEASURED, Measurement, Noise, Specimen, Striker
 from foamfit.data.rig import Candidate, Rig, beyond, candidates, read_rig
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting.branches import unreached
 from foamfit.fitting.minimizer import problem_of
 from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import make_params, make_problem
@@ -32,15 +34,15 @@ from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.published import published
 from foamfit.study import gain
-from foamfit.study.draws import Test, known_of
-from foamfit.study.gain import Known, Seen
+from foamfit.study.draws import known_of
+from foamfit.study.gain import Known, Seen, Test
 from foamfit.study.joint_result import JointResult
-from foamfit.study.others import others_of, with_others
+from foamfit.study.others import others_of
 from foamfit.study.saved import load, with_record
 from foamfit.text import counted
 
 DRAWS = 40  # number of drawn foams
-FEWER_DRAWS = 16  # the same for springs in series, each of which is fitted in other ways
+FEWER_DRAWS = 16  # those of springs in series with information, as others are fitted to each
 NEARLY = 0.1  # tests that determine this many parameters fewer, on average, count as equal
 # What a softer test may lose: parameters, on average, but only a PART of those that the best one
 # adds, and this share of the width of intervals. A faster one is also more likely to break the rig:
@@ -48,9 +50,8 @@ NEARLY = 0.1  # tests that determine this many parameters fewer, on average, cou
 FEWER, PART, WIDER = 0.5, 0.25, 0.05
 PAIRED = 20  # number of tests whose pairs are compared
 TOLD_APART = 9.0  # rise of χ² at which a test tells two laws apart
-# The closing velocity is sought at SPEEDS down to a SLOWEST part of the largest; then its interval
-# is halved.
-SPEEDS, SLOWEST, HALVINGS = 18, 40.0, 8
+# The closing velocity is sought at SPEEDS down to a SLOWEST part of the largest, then by bisection.
+SPEEDS, SLOWEST = 18, 40.0
 
 
 @single_threaded
@@ -91,25 +92,41 @@ def plan(
     """
     tests, rivals = _read(results)
     rng, test = np.random.default_rng(seed), tests[0].problem.measurement
-    limits, asked = _candidates(tests[0], rivals, rig)
+    # A hold is worth a try if one of the laws relaxes.
+    relaxing = any(one.problem.model.relaxation for one in (tests[0], *rivals.values()))
+    limits = read_rig(None if rig is None else Path(rig), test, relaxing=relaxing)
+    if not (asked := candidates(limits, test, len(tests[0].problem.model.kinds))):
+        raise InputError(
+            f"{test.name}: no test to plan; give a rig with a [striker] or a [machine] "
+            "(foamfit init --rig RIG.toml writes a draft)"
+        )
     progress(0.0, "drawing what the tests leave open")
-    known = known_of(tests, rng, FEWER_DRAWS if tests[0].problem.model.has_several else DRAWS)
+    informed = FEWER_DRAWS if tests[0].problem.model.has_several else DRAWS
+    known = known_of(tests, rng, DRAWS, informed)
     others = {name: known_of([one], rng, 0) for name, one in rivals.items()}
     target = None if quantity is None else gain.Target.of(quantity, known, limits)
     contradicted = known.missed > 0.0 and any(x.fit and x.fit.contradictions for x in tests)
-    judge = _Judge(known, _now(known, tests), target, contradicted)
+    now = _now(known, tests)
+    least = sum(one.probability for one in now.values())
+    if known.explained:
+        progress(0.2, "other springs that would show the same")
+        some = known.first(len(known.draws) // 2)
+        rough = [_outcome(some, None, False, one, gain.look(some, one, limits)) for one in asked]
+        if likely := _advised([one for one in rough if not one.risky], least):
+            found = others_of(known, tests, likely.candidate, limits)
+            known = replace(known, others=found)
+    outcome = partial(_outcome, known, target, contradicted)
     seen = list[Seen]()
     for i, one in enumerate(asked):
-        progress(0.05 + 0.65 * i / len(asked), f"{counted(len(asked), 'candidate')}, {i} done")
+        progress(0.3 + 0.6 * i / len(asked), f"{counted(len(asked), 'candidate')}, {i} done")
         seen.append(gain.look(known, one, limits, others))
-    outcomes, safe, best = judge.of(asked, seen)
-    if best is not None and known.explained is not None:
-        progress(0.7, "other springs that would show the same")
-        each = others_of(known, tests, asked[best], limits)
-        seen = [with_others(known, each, *x, limits) for x in zip(asked, seen, strict=True)]
-        outcomes, safe, best = judge.of(asked, seen)
+    outcomes = list(map(outcome, asked, seen))
+    safe = [i for i, one in enumerate(outcomes) if not one.risky]
+    # The two safe tests that determine most together, of those that determine most alone
+    first = sorted(safe, key=lambda i: -outcomes[i].number)[:PAIRED]
+    pairs = [(outcome(asked[i], seen[i], seen[j]), asked[j]) for i, j in combinations(first, 2)]
     progress(0.92, "what no test of this rig determines")
-    shown = [judge.now, *(outcomes[i].expected for i in safe)]
+    shown = [now, *(outcomes[i].expected for i in safe)]
     never = _beyond(known, shown, limits, impacts=not contradicted)
     progress(0.97, "the velocity that closes the loop")
     return Plan(
@@ -118,10 +135,10 @@ def plan(
         model=known.problem.model.name,
         relaxation=known.problem.model.relaxation,
         rig=limits,
-        now=judge.now,
+        now=now,
         outcomes=tuple(outcomes),
-        advice=None if best is None else outcomes[best],
-        pair=judge.pair(outcomes, seen, safe),
+        advice=_advised([outcomes[i] for i in safe], least),
+        pair=max(pairs, key=lambda one: one[0].number, default=None),
         never=never,
         closing={mass: _closing(known, mass, limits) for mass in limits.masses},
         quantity=None
@@ -136,22 +153,6 @@ def plan(
 
 
 # ------------------------------------------------------------------ the tests at hand
-
-
-def _candidates(
-    first: Test, rivals: Mapping[str, Test], rig: str | Path | None
-) -> tuple[Rig, list[Candidate]]:
-    """Return the rig and its tests to choose from; InputError if there are none."""
-    test = first.problem.measurement
-    # A hold is worth a try if one of the laws relaxes.
-    relaxing = any(one.problem.model.relaxation for one in (first, *rivals.values()))
-    limits = read_rig(None if rig is None else Path(rig), test, relaxing=relaxing)
-    if asked := candidates(limits, test, len(first.problem.model.kinds)):
-        return limits, asked
-    raise InputError(
-        f"{test.name}: no test to plan; give a rig with a [striker] or a [machine] "
-        "(foamfit init --rig RIG.toml writes a draft)"
-    )
 
 
 def _as_fitted(tests: Sequence[Test]) -> dict[str, Any]:
@@ -196,12 +197,9 @@ def _published(name: str) -> Test:
     heights = tuple(drive.heights) if len(drive.springs) > 1 else None
     time = np.linspace(0.0, 6.0 * height / one.striker_velocity, 601)
     seen = simulate(chain, Impact(one.striker_mass, one.striker_velocity), time)
-    rows = slice(int(np.searchsorted(time, seen.contact_end or time[-1])))  # as a fit uses them
-    time, stress, moved = (
-        time[rows],
-        np.maximum(seen.base_stress, 0.0)[rows],
-        seen.displacement[-1, rows],
-    )
+    curves = time, np.maximum(seen.base_stress, 0.0), seen.displacement[-1]
+    rows = int(np.searchsorted(time, seen.contact_end or time[-1]))  # as a fit uses them
+    time, stress, moved = (one[:rows] for one in curves)
     test = Measurement(
         name=f"{name} (simulated)", path=None, data_sha256="", time=time, stress=stress,
         displacement=moved, specimen=Specimen(height, chain.area, one.specimen_mass, heights),
@@ -222,7 +220,8 @@ def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
     out, fit = gain.expected(known, []), tests[0].fit
     if fit is None or len(tests) > 1:
         return out
-    for name, size in zip(known.names, known.sizes.tolist(), strict=True):
+    sizes = known.problem.sizes(known.names, tests[0].values).tolist()
+    for name, size in zip(known.names, sizes, strict=True):
         one = fit.parameters[name]
         width = math.nan if one.ci95 is None else one.ci95[1] - one.ci95[0]
         share, chance = 0.5 * width / size, float(one.state == "determined")
@@ -233,72 +232,49 @@ def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
 # ------------------------------------------------------------------ the advice
 
 
-@dataclass(frozen=True, eq=False)
-class _Judge:
-    """What the tests at hand say, by which candidates are judged."""
+def _outcome(
+    known: Known, target: gain.Target | None, contradicted: bool, one: Candidate, *seen: Seen
+) -> Outcome:
+    """Return what a candidate would determine, together with others of which more is seen.
 
-    known: Known
-    now: dict[str, Expected]
-    target: gain.Target | None
-    contradicted: bool  # whether some record contradicts itself where the law errs as well
-
-    def outcome(self, one: Candidate, *seen: Seen) -> Outcome:
-        """Return what a candidate would determine, together with others of which more is seen."""
-        risk = np.any([each.broken for each in seen], axis=0)
-        error = None if self.target is None else self.target.error(self.known, seen)
-        found = gain.expected(self.known, seen)
-        if self.contradicted and one.drive == "impact":  # as in a fit
-            found = {name: x.capped() for name, x in found.items()}
-        return Outcome(one, float(np.mean(risk)), found, seen[0].force, error, seen[0].apart)
-
-    def of(
-        self, asked: Sequence[Candidate], seen: Sequence[Seen]
-    ) -> tuple[list[Outcome], list[int], int | None]:
-        """Return the outcomes of candidates, and the places of the safe ones and the best one."""
-        outcomes = list(map(self.outcome, asked, seen))
-        safe = [i for i, one in enumerate(outcomes) if not one.risky]
-        now = sum(one.probability for one in self.now.values())
-        return outcomes, safe, _advised(outcomes, safe, now) if safe else None
-
-    def pair(
-        self, outcomes: Sequence[Outcome], seen: Sequence[Seen], safe: Sequence[int]
-    ) -> tuple[Outcome, Candidate] | None:
-        """Return what the two safe tests would determine that determine most, and the second."""
-        first = sorted(safe, key=lambda i: -outcomes[i].number)[:PAIRED]
-        asked = [one.candidate for one in outcomes]
-        both = combinations(first, 2)
-        made = [(self.outcome(asked[i], seen[i], seen[j]), asked[j]) for i, j in both]
-        return max(made, key=lambda one: one[0].number, default=None)
+    `contradicted` is whether a record contradicts itself where the law errs as well.
+    """
+    risk = np.any([each.broken for each in seen], axis=0)
+    error = None if target is None else target.error(known, seen)
+    found = gain.expected(known, seen)
+    if contradicted and one.drive == "impact":  # as in a fit
+        found = {name: x.capped() for name, x in found.items()}
+    return Outcome(one, float(np.mean(risk)), found, seen[0].force, error, seen[0].apart)
 
 
-def _advised(outcomes: Sequence[Outcome], safe: Sequence[int], now: float) -> int:
-    """Return the place of the advised test among those that are `safe`.
+def _advised(safe: Sequence[Outcome], now: float) -> Outcome | None:
+    """Return the advised one of some safe tests; None if there are none.
 
     It is the softest of those that determine most parameters with the narrowest intervals, or with
     a quantity asked for the one with its least error; if none determines more than `now`, it is the
     one with the narrowest intervals. With rivals it tells them apart, if a test can.
     """
 
-    def least_apart(i: int) -> float:
-        return min(outcomes[i].apart.values(), default=math.inf)
+    def least_apart(one: Outcome) -> float:
+        return min(one.apart.values(), default=math.inf)
 
-    def effort(i: int) -> tuple[bool, float, int, float]:
-        asked = outcomes[i].candidate
-        return asked.interior is not None, asked.hold, asked.cycles, outcomes[i].force
+    def effort(one: Outcome) -> tuple[bool, float, int, float]:
+        asked = one.candidate
+        return asked.interior is not None, asked.hold, asked.cycles, one.force
 
-    most = max(outcomes[i].number for i in safe)
-    good = [i for i in safe if outcomes[i].number >= most - NEARLY]
-    told = [i for i in good if least_apart(i) >= TOLD_APART]
-    if not told:
-        return max(good, key=least_apart)
-    if outcomes[told[0]].error is not None:
-        return min(told, key=lambda i: outcomes[i].error or 0.0)
+    most = max((one.number for one in safe), default=0.0)
+    good = [one for one in safe if one.number >= most - NEARLY]
+    told = [one for one in safe if least_apart(one) >= TOLD_APART]
+    if not (best := [one for one in good if one in told]):
+        return max(good, key=least_apart, default=None)
+    if best[0].error is not None:
+        return min(best, key=lambda one: one.error or 0.0)
     if most <= now + NEARLY:
-        return min(told, key=lambda i: outcomes[i].narrowness)
+        return min(best, key=attrgetter("narrowness"))
     enough = most - min(FEWER, PART * (most - now))
-    near = [i for i in safe if outcomes[i].number >= enough and least_apart(i) >= TOLD_APART]
-    least = min(outcomes[i].narrowness for i in near)
-    return min((i for i in near if outcomes[i].narrowness <= least + WIDER), key=effort)
+    near = [one for one in told if one.number >= enough]
+    least = min(one.narrowness for one in near)
+    return min((one for one in near if one.narrowness <= least + WIDER), key=effort)
 
 
 def _beyond(
@@ -309,8 +285,7 @@ def _beyond(
     left = [name for name in known.names if name not in sure]
     problem, out = known.problem, dict.fromkeys(left, "")
     test, springs = problem.measurement, len(problem.model.kinds)
-    few: dict[str, Any] = {n: getattr(known, n) for n in ("draws", "bread", "meat", "reached")}
-    some = replace(known, **{n: each[: len(known.draws) // 4] for n, each in few.items()})
+    some = known.first(len(known.draws) // 4)
     for what, other in beyond(rig, springs) if left else ():
         made = [one for one in candidates(other, test, springs) if not one.repeat]
         made = [one for one in made if impacts or one.drive != "impact"]
@@ -329,29 +304,25 @@ def _closing(known: Known, mass: float, rig: Rig) -> tuple[float, float]:
     """
     top = 2.0 * rig.velocity[1]
     speeds = np.geomspace(*rig.velocity, 4).tolist()
-    made = [gain.problem_for(known, Candidate("impact", mass, speed), rig) for speed in speeds]
-    problem = max(made, key=lambda one: float(one.objective.time[-1]))  # of the longest contact
-    at, needed = problem.index[VELOCITY], list[float]()
+    made = [gain.as_test(known, Candidate("impact", mass, speed), rig) for speed in speeds]
+    test = max(made, key=lambda one: float(one.problem.objective.time[-1]))  # the longest contact
+    at, needed = test.problem.index[VELOCITY], list[float]()
 
-    def closed(values: Array, speed: float) -> bool:
+    def closed(speed: float, values: Array) -> bool:
         values[at] = speed
         try:
-            shown = problem.objective.simulate(values, everything=True)
+            shown = test.problem.objective.simulate(values, everything=True)
         except SimulationError:
             return True  # beyond the lock-up
-        return not set(unreached(problem, shown)) & {*known.names}
+        return bool(test.reached(shown, known.names).all())
 
     tried = np.geomspace(top / SLOWEST, top, SPEEDS).tolist()
-    for drawn in known.draws:
-        values = known.with_springs(drawn, problem)
-        first = next((i for i, speed in enumerate(tried) if closed(values, speed)), None)
-        if not first:  # at no velocity, or at any
+    for values in map(test.with_springs, known.drawn):
+        first = next((i for i, speed in enumerate(tried) if closed(speed, values)), None)
+        if first:
+            ends = tried[first - 1], tried[first]
+            needed.append(optimize.bisect(lambda *x: closed(*x) - 0.5, *ends, (values,), rtol=1e-3))
+        else:  # at no velocity, or at any
             needed.append(math.inf if first is None else 0.0)
-            continue
-        low, high = tried[first - 1], tried[first]
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if closed(values, middle) else (middle, high)
-        needed.append(high)
     half, sure = np.quantile(needed, (0.5, 0.95), method="higher").tolist()
     return half, sure

@@ -269,27 +269,21 @@ def _map(ax: Axes, plan: Plan) -> None:
     Of several tests with the same settings the best counts. Tests that exceed a limit with more
     than 5 % probability are hatched.
     """
-    impact = bool(plan.rig.masses)
+    impact, table = bool(plan.rig.masses), plan.table()
     axes = ("velocity", "mass") if impact else ("rate", "strain")
-
-    def settings(one: Outcome) -> tuple[float, float] | None:
-        x, y = (getattr(one.candidate, name) for name in axes)
-        return None if x is None or y is None or one.candidate.repeat else (x, y)
-
-    ranked = sorted(plan.outcomes, key=lambda one: one.number)
-    best = {at: one for one in ranked if (at := settings(one)) is not None}
-    x, y = (sorted({at[i] for at in best}) for i in (0, 1))
-    count = np.full((len(y), len(x)), np.nan)
+    best = (
+        table[~table["repeat"].astype(bool)].sort_values("determined").groupby([*axes[::-1]]).last()
+    )
+    count, risk = best["determined"].unstack(), best["breaks"].unstack()
+    x, y = count.columns.astype(float).to_list(), count.index.astype(float).to_list()
     style: Any = {"facecolor": "none", "edgecolor": VERMILION, "hatch": "////", "linewidth": 0.0}
-    for at, one in best.items():
-        column, row = x.index(at[0]), y.index(at[1])
-        count[row, column] = one.number
-        if one.risky:
-            ax.fill_between((column - 0.5, column + 0.5), row - 0.5, row + 0.5, **style)
+    for row, column in np.argwhere(risk.to_numpy() > RISKY):
+        ax.fill_between((column - 0.5, column + 0.5), row - 0.5, row + 0.5, **style)
     shown = ax.imshow(
         count, cmap="Blues", vmin=0, vmax=len(plan.now), origin="lower", aspect="auto"
     )
-    if plan.advice is not None and (at := settings(plan.advice)) in best and at is not None:
+    at = plan.advice and [getattr(plan.advice.candidate, name) for name in axes]
+    if at and at[0] in x and at[1] in y:
         star: Any = {"color": VERMILION, "ms": 11, "mec": "white", "ls": "none"}
         ax.plot(x.index(at[0]), y.index(at[1]), "*", label="advised test", **star)
     for mass, (half, _) in plan.closing.items():
