@@ -242,7 +242,7 @@ def _with_open(
         places = problem.model.own_places[i] + np.arange(own.size)
         unseen = np.isin(places, open_)
         if law.likely is not None and unseen.any():
-            own[unseen] = law.likely(own, rng.random(len(law.params)))[unseen]
+            own[unseen] = law.likely(own, ~unseen, rng.random(len(law.params)))[unseen]
             open_ = np.setdiff1d(open_, places)
     point = space.encode(values)
     for j, one in enumerate(space.coordinates):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Mask
 from foamfit.springs.law import derived_points
 from foamfit.springs.laws.record import LAST_STRAIN, Between, Compared, Law, Param, PointOf
 from foamfit.springs.laws.shared import K0, KC, steeper
@@ -205,18 +205,19 @@ def _neighbours(values: Array, top: float) -> Iterator[Array]:
     return steeper(values, 1, 4, top, _sigma_a(k0, eps_a) + dsigma)
 
 
-def _likely(values: Array, marks: Array) -> Array:
+def _likely(values: Array, seen: Mask, marks: Array) -> Array:
     """Return a foam with the ratios of those in Tables 2 and 3 of the paper, with wide margins.
 
-    There k_c/k0 is 15 to 40, Δσ/σ_a -0.2 to -0.8, ε_c - ε_a 0.17 to 0.36, and branch e runs nearly
-    through the origin, k_h- = σ̄_c/ε_c within 20 %.
+    There k_c/k0 is 15 to 40, k_h+/k0 3 to 6, Δσ/σ_a -0.2 to -0.8, ε_c - ε_a 0.17 to 0.36, and
+    branch e runs nearly through the origin, k_h- = σ̄_c/ε_c within 20 %. A k0 below k_h+/3 is open,
+    and k_c is that of this value.
     """
     k0, eps_a, u = values[0], values[3], marks
     sigma_a = _sigma_a(k0, eps_a)
-    kc, drop = k0 * 10.0 ** (0.6 + 1.2 * u[1]), 0.05 + 0.85 * u[2]
+    kh_plus = values[5] if seen[5] else k0 * (0.1 + 4.0 * u[5])
+    kc, drop = max(k0, kh_plus / 3.0) * 10.0 ** (0.6 + 1.2 * u[1]), 0.05 + 0.85 * u[2]
     eps_c = min(eps_a + 0.05 * 10.0 ** u[4], 0.9 * LAST_STRAIN)  # of unknown magnitude
     kh_minus = sigma_a * (1.0 - drop) / eps_c * (0.5 + 0.7 * u[6])
-    kh_plus = k0 * (0.1 + 4.0 * u[5])
     return np.array([k0, kc, -drop * sigma_a, eps_a, eps_c, kh_plus, kh_minus, values[7]])
 
 

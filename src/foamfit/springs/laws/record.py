@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Mask
 from foamfit.errors import InputError
 from foamfit.springs.loop import Loop
 
@@ -172,9 +172,9 @@ class Law:
     read_off: Callable[[Loop, Array, Any, int], Array] | None = None
     #: the same for one of several springs: (loop, marks, fraction of the height)
     read_in_series: Callable[[Loop, Array, float], Array] | None = None
-    #: likely(values, marks): parameters of a foam like those published, about the known ones in
-    #: `values`, for branches that no test has reached; marks (n_params,) are in [0, 1]
-    likely: Callable[[Array, Array], Array] | None = None
+    #: likely(values, seen, marks): parameters of a foam like those published, about the `seen` ones
+    #: of `values`, for branches that no test has reached; marks (n_params,) are in [0, 1]
+    likely: Callable[[Array, Mask, Array], Array] | None = None
     #: fewer(values, largest stress): parameters of springs that stay on their first branches
     fewer: Callable[[Array, float], Iterator[Array]] = _no_neighbours
     marks: int = 5  #: number of marks
