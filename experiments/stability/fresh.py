@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import foamfit as ff
+import roots
 import studies
 from families import FAMILIES, MEMORY, REMEMBERING, SEED, spec_of
 from independent import LOOSE, Array, Truth, follow, judge, over_range
@@ -35,13 +36,6 @@ MOST = {"base": 10_000_000, "long": 20_000_000}  # limit of the judge: steps tim
 USUAL_MOST = 4_000_000
 BAD, POOR = 3.0, 1.0  # error over rtol
 SLOPE_BAR = 1e-3  # allowed error of a derivative over its range, for rtol up to 1e-5
-
-
-def by_roots(scene: Scene) -> Truth:
-    """Return the solution of the judge that integrates nothing."""
-    import roots  # only this judge needs mpmath
-
-    return roots.follow(*scene)
 
 
 def moved(spec: Spec, name: str, factor: float) -> tuple[Spec, float]:
@@ -80,7 +74,7 @@ def slopes_of(spec: Spec, name: str, most: int) -> tuple[Array, Array, NDArray[n
             except ValueError:  # the scene is at the limit of admissible parameters
                 return None
             rooted = spec.get("judge") == "roots"
-            truth = by_roots(scene) if rooted else follow(*scene, LOOSE, most)
+            truth = roots.follow(*scene) if rooted else follow(*scene, LOOSE, most)
             if truth.why:
                 return None
             sides.append(np.vstack((truth.base_stress, truth.displacement)))
@@ -134,7 +128,7 @@ def lines_of(
     family, number, rtols = task
     spec, most = spec_of(family, number), most or MOST.get(family, USUAL_MOST)
     scene, known = scene_from(spec), dict[str, Any]()
-    truth = by_roots(scene) if spec.get("judge") == "roots" else judge(*scene, most)
+    truth = roots.follow(*scene) if spec.get("judge") == "roots" else judge(*scene, most)
     about = {"scene": f"{family}:{number}", "family": family}
     lines = [
         about | {"rtol": rtol} | judged(spec, scene, truth, rtol, most, known) for rtol in rtols

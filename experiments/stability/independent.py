@@ -522,14 +522,12 @@ def _suspect(
     for i in range(flags.branch.size):
         p, branch = system.springs[i], flags.branch[i]
         low, high, _, _ = _ends(p, branch, flags.ranks[i], flags.most[i])
-        e0, e1, d0, d1 = y[moving + i], y1[moving + i], k[0, moving + i], f1[moving + i]
-        if high < math.inf and d0 > 0.0 > d1:
+        way = 1.0 if k[0, moving + i] > 0.0 else -1.0
+        e0, e1, end = way * y[moving + i], way * y1[moving + i], high if way > 0.0 else -low
+        d0, d1 = way * k[0, moving + i], way * f1[moving + i]
+        if end < math.inf and d0 > 0.0 > d1:
             x = _turn(e0, d0, e1, d1, h)
-            if max(e0, e1) + 2.0 * h * d0 * x > high:
-                first = min(first, x)
-        if low > -math.inf and d0 < 0.0 < d1:
-            x = _turn(-e0, -d0, -e1, -d1, h)
-            if min(e0, e1) + 2.0 * h * d0 * x < low:
+            if max(e0, e1) + 2.0 * h * d0 * x > end:
                 first = min(first, x)
         if branch in (SNAP, AGAIN, BACK):
             way = -1.0 if branch == BACK else 1.0
@@ -793,19 +791,6 @@ def over_range(one: Array, other: Array) -> float:
     return miss / span if span > 0.0 and math.isfinite(miss) else math.inf
 
 
-def _fastest(system: System) -> float:
-    """Return the largest rate (1/s) at which dashpots stop a mass; it limits explicit steps."""
-    hold, rows, ends = [], system.springs, system.ends
-    for first, last in zip([0, *ends[:-1]], ends, strict=True):
-        eta, height = rows[first:last, ETA], rows[first:last, H]
-        hold.append(1.0 / float((height / eta).sum()) if (eta > 0.0).all() else 0.0)
-    known = system.mass if system.top == MASS else system.mass[:-1]
-    return max(
-        ((hold[g] + (hold[g + 1] if g + 1 < len(hold) else 0.0)) / m for g, m in enumerate(known)),
-        default=0.0,
-    )
-
-
 def _shares(chain: Any, drive: Any, ends: Integers) -> bool:
     """Return whether a motion may meet gaps or flat branches of several springs at one stress.
 
@@ -865,11 +850,9 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = 
         time = time - time[0]
     system, kinds = system_of(chain, drive, time)
     nodes, base = np.zeros((count, time.size)), np.zeros(time.size)
-    if not any(hasattr(s, "sigma_plus") or getattr(s, "relaxation", ()) for s in chain.springs):
-        too_long = _fastest(system) * (time[-1] - time[0]) > 6.0 * most / count
-        if too_long or _shares(chain, drive, system.ends):
-            why = WHY[TOO_LONG] if too_long else SHARED
-            return Truth(nodes, base, None, why=why)
+    memory = any(hasattr(s, "sigma_plus") or getattr(s, "relaxation", ()) for s in chain.springs)
+    if not memory and _shares(chain, drive, system.ends):
+        return Truth(nodes, base, None, why=SHARED)
     outcome, steps, end = _follow(system, kinds, time, tol, most // count, nodes, base)
     why = WHY[outcome]
     if not why and not (np.isfinite(nodes).all() and np.isfinite(base).all()):
@@ -879,11 +862,10 @@ def follow(chain: Any, drive: Any, time: Array, tol: float = TIGHT, most: int = 
 
 def judge(chain: Any, drive: Any, time: Array, most: int = MOST_WORK) -> Truth:
     """Follow a scene at two tolerances; their difference is the uncertainty of the judgement."""
-    tight = follow(chain, drive, time, TIGHT, most)
-    if tight.why:
-        return tight
-    loose = follow(chain, drive, time, LOOSE, most)
-    if loose.why:
-        return loose
-    curves = (np.vstack((one.base_stress, one.displacement)) for one in (loose, tight))
-    return replace(tight, unsure=max(map(over_range, *curves)))
+    curves = []
+    for tol in (LOOSE, TIGHT):
+        truth = follow(chain, drive, time, tol, most)
+        if truth.why:
+            return truth
+        curves.append(np.vstack((truth.base_stress, truth.displacement)))
+    return replace(truth, unsure=max(map(over_range, *curves)))
