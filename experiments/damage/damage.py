@@ -1,17 +1,14 @@
-"""What changes from cycle to cycle, and by wear? Shoe foam, and printed lattices to cycle 1000.
+"""What changes in a shoe foam from cycle to cycle, and by wear?
 
-Method and answer: README.md. Also written: twins.csv, lattice.csv and lattice.png.
+Method and answer: README.md. Also written: twins.csv and twins.png.
 
-    FOAMFIT_DATA=… python experiments/damage/damage.py    # --page: from the tables alone
+    FOAMFIT_DATA=… python experiments/damage/damage.py    # --page: from the table alone
 """
 
 import math
 import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import matplotlib
 import numpy as np
 import pandas as pd
 from scipy import stats
@@ -29,20 +26,16 @@ SHOWN = ("start_strain", "dissipated_energy", "misfit_stress_strain", *NAMES)
 # Compared by wear; a single test cannot separate kc and eps_star.
 WORN = ("dissipated_energy", "peak_stress", *(n for n in NAMES if n[3:] not in ("kc", "eps_star")))
 SHARES = ("start_strain", "misfit_stress_strain")
-LATTICE_CYCLES = (1, 2, 10, 100, 1000)
 
 
-def fitted(
-    names: Sequence[str], folder: Path, **options: Any
-) -> tuple[pd.DataFrame, dict[str, ff.CycleFits]]:
-    """Fit the cycles of some specimens; return one row per specimen and cycle, and the fits."""
-    found = {}
-    for name in names:
-        path = records.place(name, folder)
-        found[name] = ff.fit_cycles(path, intervals="local", **MODEL, **options)
-        print(name, len(found[name].results), "cycles", file=sys.stderr)
-    tables = {name: one.by_cycle.reset_index() for name, one in found.items()}
-    return pd.concat(tables, names=["specimen", None]).reset_index("specimen"), found
+def fitted(folder: Path) -> pd.DataFrame:
+    """Fit the cycles of all specimens; return one row per specimen and cycle."""
+    tables = {}
+    for name in records.HEELS:
+        found = ff.fit_cycles(records.place(name, folder), intervals="local", **MODEL)
+        tables[name] = found.by_cycle.reset_index()
+        print(name, len(found.results), "cycles", file=sys.stderr)
+    return pd.concat(tables, names=["specimen", None]).reset_index("specimen")
 
 
 def twin_table(table: pd.DataFrame) -> str:
@@ -104,61 +97,30 @@ def worn_table(table: pd.DataFrame, cycle: int) -> str:
     }), 2)  # fmt: skip
 
 
-def lattice_table(table: pd.DataFrame) -> str:
-    return studies.shown(pd.DataFrame({
-        "lattice": table["specimen"], "cycle": table["cycle"],
-        "start strain (%)": 100.0 * table["start_strain"],
-        "peak stress (kPa)": 1e-3 * table["peak_stress"],
-        "dissipated (kJ/m³)": 1e-3 * table["dissipated_energy"],
-        "misfit (%)": 100.0 * table["misfit_stress_strain"],
-    }))  # fmt: skip
-
-
-def lattice_changes(table: pd.DataFrame) -> str:
-    text = (
-        "- From cycle {} to {} the peak stress changes by a factor of {:.2f}, the dissipated "
-        "energy by {:.2f} (mean of three lattices)."
-    )
-    columns = ("peak_stress", "dissipated_energy")
-    pairs = ((1, 2), (2, 1000))
-    return "\n".join(
-        text.format(*two, *(changed(table, column, *two)[0] for column in columns)) for two in pairs
-    )
-
-
-def draw_lattices(found: dict[str, ff.CycleFits]) -> None:
-    colours = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 0.95, len(LATTICE_CYCLES)))
-    with studies.sheet(HERE / "lattice.png", 7.4, 2.3, 250) as figure:
-        axes = figure.subplots(1, 3)
-        for ax, (name, one) in zip(axes, found.items(), strict=True):
-            for (cycle, result), colour in zip(sorted(one.results.items()), colours, strict=True):
-                m = result.measurement
-                strain = m.displacement / m.specimen.height + m.start_strain
-                ax.plot(strain, m.stress / 1e3, color=colour, linewidth=0.8, label=f"cycle {cycle}")
-            ax.set(title=name, xlabel="strain from the first contact", ylabel="stress (kPa)")
-        axes[0].legend(fontsize=6)
-
-
-def measure() -> None:
-    """Fit all cycles; write both tables and the figure."""
-    studies.measurements("shoe-foam-twins", "lattice-cycles")
-    with studies.workplace() as folder:
-        lattices, found = fitted(records.LATTICES, folder, cycles=LATTICE_CYCLES)
-        twins, _ = fitted(records.HEELS, folder)
-    studies.write_csv(twins, HERE / "twins.csv", 6)
-    studies.write_csv(lattices, HERE / "lattice.csv", 6)
-    draw_lattices(found)
+def draw(table: pd.DataFrame) -> None:
+    """Draw mean and standard deviation over five specimens of what changes, by cycle."""
+    names = {"dissipated_energy": (1e3, "dissipated energy (kJ/m³)"), "s1_k0": (1e3, "k₀ (kPa)"),
+             "s1_sigma_plus": (1e3, "σ₊ (kPa)"), "s1_g1": (1.0, "g₁ (–)")}  # fmt: skip
+    groups = table.groupby([table["specimen"].str.partition("-")[0], "cycle"])[list(names)]
+    mean, spread = groups.mean(), groups.std()
+    with studies.sheet(HERE / "twins.png", 7.4, 2.1) as figure:
+        for ax, (name, (unit, label)) in zip(figure.subplots(1, 4), names.items(), strict=True):
+            for heel, colour in (("new", studies.BLUE), ("worn", studies.VERMILION)):
+                own, off = mean.loc[heel, name] / unit, spread.loc[heel, name] / unit
+                ax.errorbar(own.index, own, off, color=colour, marker=".", lw=0.9, label=heel)
+            ax.set(title=label, xlabel="cycle", ylim=(0.0, None), xticks=own.index)
+        ax.legend(loc="lower right")
 
 
 def main() -> None:
     if not studies.arguments(__doc__, page=True).parse_args().page:
-        measure()
-    twins, lattices = (pd.read_csv(HERE / f"{name}.csv") for name in ("twins", "lattice"))
+        studies.measurements("shoe-foam-twins")
+        with studies.workplace() as folder:
+            studies.write_csv(fitted(folder), HERE / "twins.csv", 6)
+    twins = pd.read_csv(HERE / "twins.csv")
+    draw(twins)
     worn = "\n\n".join(worn_table(twins, cycle) for cycle in (1, 5))
-    studies.write_page(
-        HERE, twins=twin_table(twins), told=twin_changes(twins), worn=worn,
-        lattice=lattice_table(lattices), lattice_told=lattice_changes(lattices),
-    )  # fmt: skip
+    studies.write_page(HERE, twins=twin_table(twins), told=twin_changes(twins), worn=worn)
 
 
 if __name__ == "__main__":
