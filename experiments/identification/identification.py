@@ -1,10 +1,10 @@
 """How many problems do foamfit's search and eight methods of lmfit solve in a few seconds?
 
-Method and answer: README.md. Also written: runs.csv.gz (every improvement by more than 2 %, and
-when a problem was solved), runs.json (machine, settings) and solved.png. Without FOAMFIT_DATA the
-shoe foam is omitted.
+Method and answer: README.md. Also written: runs.csv (when each run solved its problem, and its
+lowest cost), runs.json (machine, settings) and solved.png. Without FOAMFIT_DATA the shoe foam is
+omitted.
 
-    FOAMFIT_DATA=… python experiments/identification/identification.py    # 35 min of one core
+    FOAMFIT_DATA=… python experiments/identification/identification.py    # 20 min of one core
     python experiments/identification/identification.py --page            # figure and page only
 """
 
@@ -14,10 +14,10 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 import foamfit as ff
-from foamfit.fitting.box import Space
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import box_starts
@@ -41,17 +40,11 @@ import studies
 from studies import Array
 
 HERE = Path(__file__).parent
-SOLVED = 1.05  # cost over the best known cost at which a problem counts as solved
-ENOUGH = 1.001  # cost over the best known at which a run ends
-RECORDED = 0.98  # a cost is recorded below this multiple of the last recorded one
-RUN = ["problem", "coordinates", "method", "seed"]
+SOLVED = 1.05  # cost over the best known cost at which a problem is solved
+COLUMNS = ["problem", "method", "seed", "solved_after_s", "cost"]
 OWN = "foamfit.fit"
 SEEDED = ("differential_evolution", "basinhopping", "dual_annealing")
 METHODS = ("leastsq", "least_squares", "nelder", "powell", *SEEDED, "ampgo")
-COORDINATES = {
-    "si": "lmfit.Parameters in SI, bounds of make_params",
-    "box": "lmfit.Parameters in the coordinates of foamfit's search",
-}
 
 
 class Case(NamedTuple):
@@ -91,20 +84,20 @@ CASES = {
 
 
 class RunOver(Exception):  # noqa: N818 (nothing went wrong)
-    """The time is up, or the best known cost is reached."""
+    """The time is up, or the problem is solved."""
 
 
-def recorded(
+def solved_after(
     work: Callable[[], Any], objective: Objective, budget: float, known: float
-) -> list[tuple[float, float]]:
-    """Return seconds and lowest cost of a search: at each clear improvement and at its end.
+) -> tuple[float, float]:
+    """Return the processor time (s) in which a search solves a problem, and its lowest cost.
 
-    The search ends after `budget` seconds of processor time, or near the best `known` cost. Only
-    evaluations of the residual of `objective` count as progress, not those of a thinned record or
-    of one weighed by the uncertainty of its motion.
+    The time is infinite if it is not solved within `budget` seconds; `known` is the best known
+    cost. Only evaluations of the residual of `objective` count, not those of a thinned record or of
+    one weighed by the uncertainty of its motion.
     """
     plain, derivative = Objective.residual, Objective.jacobian
-    rows, lowest, began = list[tuple[float, float]](), np.inf, time.process_time()
+    solved, lowest, began = np.inf, np.inf, time.process_time()
 
     def elapsed() -> float:
         seconds = time.process_time() - began
@@ -113,13 +106,12 @@ def recorded(
         return seconds
 
     def residual(self: Objective, values: Array) -> Array:
-        nonlocal lowest
+        nonlocal lowest, solved
         out, seconds = plain(self, values), elapsed()
         if self.measurement is objective.measurement and self.weighing is None:
-            lowest, last = min(lowest, float(out @ out)), rows[-1][1] if rows else np.inf
-            if lowest < RECORDED * last or lowest <= SOLVED * known < last:
-                rows.append((seconds, lowest))
-            if lowest <= ENOUGH * known:
+            lowest = min(lowest, float(out @ out))
+            if lowest <= SOLVED * known:
+                solved = seconds
                 raise RunOver
         return out
 
@@ -134,7 +126,7 @@ def recorded(
         patch.object(Objective, "jacobian", jacobian),
     ):
         work()
-    return [*rows, (min(time.process_time() - began, budget), lowest)]
+    return solved, lowest
 
 
 def run_own(search: Callable[..., ff.FitResult], seed: int) -> None:
@@ -143,73 +135,38 @@ def run_own(search: Callable[..., ff.FitResult], seed: int) -> None:
         search(seed=1000 * seed + again)
 
 
-@dataclass(frozen=True)
-class Variables:
-    """Variables of an lmfit method, "si" or "box", and their map to the problem's vector."""
-
-    problem: Problem
-    space: Space
-    coordinates: str
-
-    def params(self, point: Array) -> lmfit.Parameters:
-        """Return parameters at a point of the box, inside their bounds for least_squares."""
-        if self.coordinates == "box":
-            params = lmfit.Parameters()
-            for j, (low, high) in enumerate(zip(*self.space.box, strict=True)):
-                params.add(f"u{j}", min=low, max=high)
-            free, start = tuple(params), point
-        else:
-            params, free = self.problem.params.copy(), self.problem.free()
-            start = self._free(self.space.decode(point))
-        for name, value in zip(free, start, strict=True):
-            low, high = params[name].min, params[name].max
-            margin = 1e-9 * (high - low)
-            params[name].value = float(np.clip(value, low + margin, high - margin))
-        params.update_constraints()
-        return params
-
-    def residual(self, params: lmfit.Parameters) -> Array:
-        """Return the residual of the problem."""
-        return self.problem.objective.residual(self._vector(params))
-
-    def jacobian(self, params: lmfit.Parameters) -> Array:
-        """Return the derivative of the residual by the free parameters, (n_data, n_free)."""
-        slopes = self.problem.slopes(self._vector(params), self.problem.free())
-        if self.coordinates == "si":
-            return slopes
-        point, step = _values(params), 1e-6
-        columns = [
-            self._free(self.space.decode(point + move) - self.space.decode(point - move))
-            for move in step * np.eye(point.size)
-        ]
-        return np.asarray(slopes @ (np.transpose(columns) / (2.0 * step)))
-
-    def _vector(self, params: lmfit.Parameters) -> Array:
-        box = self.coordinates == "box"
-        return self.space.decode(_values(params)) if box else self.problem.vector(params)
-
-    def _free(self, values: Array) -> Array:
-        return values[[self.problem.index[name] for name in self.problem.free()]]
-
-
-def _values(params: lmfit.Parameters) -> Array:
-    return np.array(list(params.valuesdict().values()))
-
-
-def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int) -> None:
+def run_lmfit(problem: Problem, method: str, seed: int) -> None:
     """Minimise repeatedly by a method of lmfit, each time from another point of the box.
 
     The points are the same for every method with the same seed.
     """
-    variables = Variables(problem, problem.space(), coordinates)
-    rng, points = np.random.default_rng(seed), list[Array]()
+    space, names = problem.space(), problem.free()
+    free, (low, high) = [problem.index[name] for name in names], space.box
+    rng, points, margin = np.random.default_rng(seed), list[Array](), 1e-9 * (high - low)
+
+    def point_of(params: lmfit.Parameters) -> Array:
+        return np.array(list(params.valuesdict().values()))
+
+    def residual(params: lmfit.Parameters) -> Array:
+        return problem.objective.residual(space.decode(point_of(params)))
+
+    def jacobian(params: lmfit.Parameters) -> Array:
+        point, step = point_of(params), 1e-6
+        moves = step * np.eye(point.size)
+        moved = np.array([space.decode(point + one) - space.decode(point - one) for one in moves])
+        slopes = problem.slopes(space.decode(point), names)
+        return np.asarray(slopes @ (moved[:, free].T / (2.0 * step)))
+
     while True:
-        points = points or list(box_starts(variables.space, rng, 32))
-        start, draw = points.pop(0), int(rng.integers(2**31))
+        points = points or list(box_starts(space, rng, 32))
+        start, draw = np.clip(points.pop(0), low + margin, high - margin), int(rng.integers(2**31))
+        params = lmfit.Parameters()
+        for j, ends in enumerate(zip(start, low, high, strict=True)):
+            params.add(f"u{j}", ends[0], min=ends[1], max=ends[2])
         np.random.seed(draw)  # noqa: NPY002 (lmfit's ampgo draws from there)
         options: dict[str, Any] = {  # of an experienced user
-            "leastsq": {"Dfun": variables.jacobian},
-            "least_squares": {"jac": variables.jacobian, "x_scale": "jac"},
+            "leastsq": {"Dfun": jacobian},
+            "least_squares": {"jac": jacobian, "x_scale": "jac"},
         }.get(method, {"seed": draw} if method in SEEDED else {})
         with (
             warnings.catch_warnings(action="ignore"),  # about covariances of lmfit, not used here
@@ -217,9 +174,8 @@ def run_lmfit(problem: Problem, method: str, coordinates: str, seed: int) -> Non
             suppress(ValueError, np.linalg.LinAlgError),  # the method restarts within its time
         ):
             lmfit.minimize(
-                variables.residual, variables.params(start), method=method, calc_covar=False,
-                max_nfev=10**9, **options,
-            )  # fmt: skip
+                residual, params, method=method, calc_covar=False, max_nfev=10**9, **options
+            )
 
 
 def run_all(options: argparse.Namespace) -> tuple[pd.DataFrame, dict[str, Any]]:
@@ -236,61 +192,46 @@ def run_all(options: argparse.Namespace) -> tuple[pd.DataFrame, dict[str, Any]]:
         long = [search(seed=seed, starts=96).problem.vector() for seed in range(9000, 9003)]
         ends = [problem.objective.residual(vector) for vector in long]
         known[key] = min(float(residual @ residual) for residual in ends)
-        for coordinates, method in [("own", OWN), *((c, m) for c in COORDINATES for m in METHODS)]:
-            for seed in range(options.seeds):
-                if method == OWN:
-                    work = partial(run_own, search, seed)
-                else:
-                    work = partial(run_lmfit, problem, method, coordinates, seed)
-                found = recorded(work, problem.objective, options.budget, known[key])
-                rows += [(key, coordinates, method, seed, *row) for row in found]
-            print(key, coordinates, method, f"{rows[-1][-1] / known[key]:.3g}", flush=True)
+        for method, seed in product((OWN, *METHODS), range(options.seeds)):
+            work = partial(run_lmfit, problem, method, seed)
+            if method == OWN:
+                work = partial(run_own, search, seed)
+            found = solved_after(work, problem.objective, options.budget, known[key])
+            rows.append((key, method, seed, *found))
+            print(*rows[-1], flush=True)
     machine = studies.circumstances("foamfit", "lmfit", "scipy", "numpy", "numba")
     setup = {"machine": machine, "budget_s": options.budget, "known": known}
-    return pd.DataFrame(rows, columns=[*RUN, "seconds", "cost"]), setup
+    return pd.DataFrame(rows, columns=COLUMNS), setup
 
 
-def solved_after(runs: pd.DataFrame, known: dict[str, float]) -> pd.DataFrame:
-    """Return one row for each run: seconds to solution (inf if never)."""
-    solved = runs["cost"] <= SOLVED * runs["problem"].map(known)
-    after = runs.assign(solved_after_s=runs["seconds"].where(solved, np.inf))
-    return after.groupby(RUN, sort=False)["solved_after_s"].min().reset_index()
+def draw(runs: pd.DataFrame, budget: float, path: Path) -> None:
+    """Plot the runs solved against seconds, for every method."""
+    with studies.sheet(path, 5.6, 3.1) as figure:
+        ax = figure.add_subplot()
+        for i, (name, own) in enumerate(runs.groupby("method", sort=False)):
+            after = np.sort(own["solved_after_s"]).clip(max=2.0 * budget)
+            share = np.arange(after.size + 1) / after.size
+            style = {"color": matplotlib.colormaps["tab10"](i), "linewidth": 2.0 - (i > 0)}
+            ax.step([0.01, *after], 100.0 * share, where="post", label=name, **style)
+        ax.set(xscale="log", xlim=(0.01, budget), ylim=(0.0, 101.0))
+        ax.set(xlabel="processor time (s)", ylabel="runs solved (%)")
+        studies.gridlines(ax)
+        figure.legend(loc="outside right center")
 
 
-def draw(ends: pd.DataFrame, budget: float, path: Path) -> None:
-    """Plot the runs solved against seconds, for the methods in each kind of coordinates."""
-    order = (OWN, *METHODS)
-    with studies.sheet(path, 7.0, 3.4) as figure:
-        axes = figure.subplots(1, len(COORDINATES), sharey=True)
-        for ax, (coordinates, title) in zip(axes, COORDINATES.items(), strict=True):
-            among = ends[ends["coordinates"].isin(("own", coordinates))]
-            for i, name in enumerate(order):
-                own = among.loc[among["method"] == name, "solved_after_s"]
-                after = np.sort(own).clip(max=2.0 * budget)
-                share = np.arange(after.size + 1) / after.size
-                style = {"color": matplotlib.colormaps["tab10"](i), "linewidth": 2.0 - (i > 0)}
-                ax.step([0.01, *after], 100.0 * share, where="post", label=name, **style)
-            ax.set(xscale="log", xlim=(0.01, budget), ylim=(0.0, 101.0), title=title)
-            ax.set_xlabel("processor time (s)")
-            studies.gridlines(ax)
-        axes[0].set_ylabel("runs solved (%)")
-        figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=5)
-
-
-def summary(ends: pd.DataFrame, known: dict[str, float]) -> str:
+def summary(runs: pd.DataFrame, problems: Iterable[str]) -> str:
     """Return a Markdown table: one row for each method, one column for each problem."""
     rows = []
-    for (coordinates, method), own in ends.groupby(["coordinates", "method"], sort=False):
+    for method, own in runs.groupby("method", sort=False):
         cells = []
-        for key in known:
+        for key in problems:
             after = own.loc[own["problem"] == key, "solved_after_s"]
             median = np.quantile(after, 0.5, method="inverted_cdf")
             shown = f"{median:.2f} s" if np.isfinite(median) else "never"
             cells.append(f"{np.isfinite(after).sum()} of {len(after)}, {shown}")
         solved = np.isfinite(own["solved_after_s"])
-        rows.append([method, coordinates, *cells, f"{solved.sum()} of {len(own)}"])
-    titles = [CASES[key].title for key in known]
-    return studies.markdown(["method", "in", *titles, "all"], rows)
+        rows.append([method, *cells, f"{solved.sum()} of {len(own)}"])
+    return studies.markdown(["method", *(CASES[key].title for key in problems), "all"], rows)
 
 
 def main() -> None:
@@ -299,20 +240,17 @@ def main() -> None:
     parser.add_argument("--problems", nargs="+", choices=list(CASES), default=list(CASES))
     options = parser.parse_args()
     threadpool_limits(1)  # for all, so that processor time is elapsed time
-    log, notes = options.out / "runs.csv.gz", options.out / "runs.json"
+    log, notes = options.out / "runs.csv", options.out / "runs.json"
     if not options.page:
         runs, setup = run_all(options)
         studies.write_csv(runs, log, 5)
         notes.write_text(json.dumps(setup, indent=1) + "\n")
     runs, setup = pd.read_csv(log), json.loads(notes.read_text())
-    lowest = runs.groupby("problem")["cost"].min()
-    known = {key: min(cost, float(lowest[key])) for key, cost in setup["known"].items()}
-    ends = solved_after(runs, known)
-    draw(ends, setup["budget_s"], options.out / "solved.png")
+    draw(runs, setup["budget_s"], options.out / "solved.png")
     studies.write_page(
-        HERE, options.out, seeds=runs["seed"].nunique(), problems=len(known),
+        HERE, options.out, seeds=runs["seed"].nunique(), problems=len(setup["known"]),
         budget=setup["budget_s"], machine=setup["machine"],
-        table=summary(ends, known),
+        table=summary(runs, setup["known"]),
     )  # fmt: skip
 
 
