@@ -10,22 +10,20 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from scipy.special import ndtri
 
 import foamfit as ff
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
-from cycles import Ensemble
 from studies import BLACK, BLUE, GREY, VERMILION, Array
 
 HERE = Path(__file__).parent
 
-VALUES = {
-    "k0": 5.5e5, "kc": 2.5e5, "eps_star": 0.08, "sigma_plus": 1.3e5, "spread_plus": 0.4,
-    "sigma_minus": 5.5e4, "spread_minus": 0.77, "stiffening": 1.0, "softening": 0.0,
-    "weakening": 0.0,
-}  # fmt: skip
-SPRING = ff.MicroscaleSpring(**VALUES)
+K0, KC, EPS_STAR, SIGMA_PLUS, SPREAD_PLUS, SIGMA_MINUS, SPREAD_MINUS = VALUES = (
+    5.5e5, 2.5e5, 0.08, 1.3e5, 0.4, 5.5e4, 0.77,
+)  # fmt: skip
+SPRING = ff.MicroscaleSpring(*VALUES)
 NUMBERS = (2, 3, 5, 10, 20, 30, 50, 100, 200, 300, 500, 1000)
 SHOWN = 10
 # Turning points of the stress, Pa: a loop with two inner loops, one nested, and continuation.
@@ -34,12 +32,16 @@ BETWEEN = 400  # samples between turning points, for the comparison
 
 
 def followed(n: int, history: Array) -> Array:
-    """Return the strain of n micro-springs at each stress of a history."""
-    row, out = Ensemble(VALUES, n), np.empty(history.size)
+    """Return the mean strain of n micro-springs, of equal shares, at each stress of a history."""
+    ranks = ndtri((np.arange(n) + 0.5) / n)
+    through = SIGMA_PLUS * np.exp(SPREAD_PLUS * ranks)
+    back = np.minimum(SIGMA_MINUS * np.exp(SPREAD_MINUS * ranks), through)
+    snapped, last, share = np.zeros(n, bool), 0.0, np.empty(history.size)
     for j, stress in enumerate(history):
-        row.stress, row.snapped = float(stress), row.after(float(stress))
-        out[j] = row.strain(row.stress, row.snapped)
-    return out
+        snapped = snapped | (stress >= through) if stress >= last else snapped & (stress >= back)
+        last, share[j] = stress, snapped.mean()
+    on_a, on_c = history / (K0 + history), EPS_STAR + history / (KC + history)
+    return on_a + share * (on_c - on_a)
 
 
 def history(between: int = BETWEEN) -> Array:

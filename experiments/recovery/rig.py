@@ -25,6 +25,7 @@ from truth import Array, Bistable, Course, Law, Microscale, Motion, Rig, Terms
 
 GRAVITY = 9.80665
 DURATION = 4.0  # s, of a slow motion
+LEAST, LEFT = 0.02, 0.3  # between cycles: stress and displacement over the largest
 MOST_STRAIN = 0.93
 UNITS = {
     "force": ("N", 1.0), "displacement": ("mm", 1e3), "acceleration": ("m/s^2", 1.0),
@@ -75,6 +76,7 @@ class Slow:
     `law` is "bistable", "microscale" or bistable springs joined by "+", all of the same height.
     With `dashpot` a single spring has an eta. `motion` is "triangle", "sine", "trapezoid" (a short
     hold) or "ramp" (a slow start). `inner` is the size of a partial unloading relative to the peak.
+    Under several `cycles` a microscale spring remembers what has snapped.
     `noise` is relative to the range of displacement and of force; `noise_given` writes it to the
     TOML, and with `exact` the displacement has no noise. With `early` the motion starts before
     contact; with `zero` its zero is arbitrary.
@@ -85,6 +87,7 @@ class Slow:
     dashpot: bool = False
     motion: str = "triangle"
     inner: float = 0.0
+    cycles: int = 1
     rows: int = 1000
     noise: float = 0.003
     early: bool = False
@@ -111,11 +114,6 @@ class Record:
     course: Course
     toml_velocity: str = ""
     delay_sd: float = 0.0  # s
-
-    @property
-    def model(self) -> str:
-        """Value of `--model`."""
-        return self.setup.law
 
 
 def draw_bistable(rng: np.random.Generator) -> Bistable:
@@ -144,6 +142,23 @@ def draw_microscale(rng: np.random.Generator) -> tuple[Microscale, float]:
         )  # fmt: skip
         most = plus * math.exp(spread * float(ndtri(rng.uniform(0.7, 0.98))))
         if spring.strain(most) < 0.85:
+            return spring, most
+
+
+def draw_worn(rng: np.random.Generator) -> tuple[Microscale, float]:
+    """Draw a microscale spring that remembers what has snapped; see `draw_microscale`."""
+    while True:
+        spring, most = draw_microscale(rng)
+        n, softening = 10.0 ** rng.uniform(0.0, 1.2), rng.uniform(0.3, 1.0)
+        ratio = np.geomspace(1e-4, 1e4, 2001)  # of stress and softened stiffness
+        stress = ratio * spring.k0 * math.exp(-softening)
+        on_a, on_c = 1.0 - (1.0 + n * ratio) ** (-1.0 / n), stress / (spring.kc + stress)
+        least = max(float((on_a - on_c).max()), 0.0)
+        spring = replace(
+            spring, eps_star=least + rng.uniform(0.02, 0.2), stiffening=n, softening=softening,
+            weakening=rng.uniform(0.1, 0.5),
+        )  # fmt: skip
+        if spring.strain(most) < 0.82:
             return spring, most
 
 
@@ -295,12 +310,28 @@ def slow_motion(setup: Slow, peak: float, rng: np.random.Generator) -> Motion:
     return Motion(tuple(times.tolist()), tuple(levels), shapes)
 
 
+def cycled(rig: Rig, cycles: int) -> Motion:
+    """Repeat the loading of a motion, each time 2 % deeper, without losing contact in between."""
+    assert rig.motion is not None
+    first, peak = rig.motion.levels[:2]
+    times, levels, speed = [0.0], [first], 2.0 * peak / DURATION
+    for cycle in range(cycles):
+        for level in (peak * (1.0 + 0.02 * cycle), 0.0):
+            times.append(times[-1] + abs(level - levels[-1]) / speed)
+            levels.append(level)
+        motion = Motion(tuple(times), tuple(levels), ("line",) * (2 * cycle + 2))
+        when, stress = replace(rig, motion=motion).pressed(motion.contact(), times[-1])
+        end = when[(when > times[-2]) & (stress < LEAST * stress.max())][:1]
+        times[-1], levels[-1] = float(end[0]), float(motion.at(end)[0])
+    return Motion(tuple(times), tuple(levels), motion.shapes)
+
+
 def drawn_slow(setup: Slow, rng: np.random.Generator) -> Course:
     """Draw springs and a motion that closes their loops; simulate."""
     kinds = setup.law.split("+")
     while True:
         if kinds[0] == "microscale":
-            spring, most = draw_microscale(rng)
+            spring, most = draw_microscale(rng) if setup.cycles == 1 else draw_worn(rng)
             springs: list[Law] = [spring]
         else:
             springs = [draw_bistable(rng) for _ in kinds]
@@ -319,6 +350,11 @@ def drawn_slow(setup: Slow, rng: np.random.Generator) -> Course:
         springs[0] = replace(springs[0], relaxation=terms, eta=eta if setup.dashpot else 0.0)
         springs = sorted(springs, key=lambda s: s.onset) if len(kinds) > 1 else springs
         rig = Rig(tuple(springs), heights, SLOW_AREA, motion=motion)
+        if setup.cycles > 1:
+            motion = cycled(rig, setup.cycles)
+            rig = replace(rig, motion=motion)
+            if motion.levels[-1] > LEFT * peak:
+                continue
         course = rig.run(motion.contact(), motion.times[-1])
         if course.end > motion.times[-2] + 0.3 * (motion.times[-1] - motion.times[-2]):
             return course

@@ -1,9 +1,9 @@
 """Do the 95 % intervals contain the true values on records like those of a test rig?
 
 Method and answer: README.md. Synthetic tests of four families are processed like a user's: impact
-and slow (`rig`), fault (impacts with a wrong number or channel) and memory (three cycles,
-`cycles`). A row for each parameter contains true value and interval; a test that cannot be read or
-fitted gets a row with the message.
+and slow (`rig`), fault (impacts with a wrong number or channel) and memory (three cycles). A row
+for each parameter contains true value and interval; a test that cannot be read or fitted gets a row
+with the message.
 
     python experiments/recovery/rigs.py --raw rows.csv         # 200 tests of each class, resumable
     python experiments/recovery/rigs.py --family slow --classes microscale --tests 20
@@ -28,7 +28,6 @@ from foamfit.data.calibration import contradictions
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
-from cycles import Cycled, cycled
 from rig import Impact, Record, Slow, impact, slow, write
 from truth import Array, Bistable, Rig
 
@@ -139,16 +138,17 @@ FAULTS: dict[str, Callable[[Record], Record]] = {
         "lag of 3 %": lambda force, since, _: np.interp(since - 0.03, since, force),
     }.items()
 }
+MEMORY = {
+    "three cycles": Slow(relaxation=1, cycles=3, rows=1200, noise=1e-3, early=True, zero=True)
+}
 FAMILIES: dict[str, dict[str, Any]] = {
-    "impact": IMPACTS, "slow": SLOW, "fault": FAULTS, "memory": {"three cycles": None},
+    "impact": IMPACTS, "slow": SLOW, "fault": FAULTS, "memory": MEMORY,
 }  # fmt: skip
 
 
-def make(family: str, name: str, seed: int) -> Any:
+def make(family: str, name: str, seed: int) -> Record:
     """Return one record of a class."""
     setup = FAMILIES[family][name]
-    if family == "memory":
-        return cycled(seed)
     if family == "fault":
         return setup(impact(Impact(), seed))
     return impact(setup, seed) if family == "impact" else slow(setup, seed)
@@ -161,21 +161,20 @@ def chain_of(made: Rig) -> ff.Chain:
     return ff.Chain(springs, made.heights, made.area)
 
 
-def fitted(record: Record | Cycled) -> tuple[ff.Measurement, dict[str, Any]]:
+def fitted(record: Record) -> tuple[ff.Measurement, dict[str, Any]]:
     """Write, read and fit a record; return test and estimates with a true value.
 
     The rig numbers springs by the stress at which they start to snap, and relaxation terms by their
     time, like the fit.
     """
+    options: dict[str, Any] = {"model": record.setup.law, "relaxation": record.setup.relaxation}
+    cycles = getattr(record.setup, "cycles", 1)
     with studies.workplace() as folder:
-        if isinstance(record, Cycled):
-            test = ff.read_test(record.write(folder), cycles=(1, 3))
-            options: dict[str, Any] = {"model": "microscale", "relaxation": 1}
-            options |= {"stiffening": True, "mullins": True}
-        else:
-            test = ff.read_test(write(record, folder))
-            options = {"model": record.model, "relaxation": record.setup.relaxation}
-    if getattr(getattr(record, "setup", None), "dashpot", False):  # fixed at zero by default
+        path = write(record, folder)
+        test = ff.read_test(path, cycles=(1, cycles)) if cycles > 1 else ff.read_test(path)
+    if cycles > 1:
+        options |= {"stiffening": True, "mullins": True}
+    if getattr(record.setup, "dashpot", False):  # fixed at zero by default
         options["params"] = ff.make_params(test, drive="displacement", **options)
         options["params"]["s1_eta"].vary = True
     result = ff.fit(test, seed=0, **options)

@@ -82,12 +82,14 @@ class Microscale:
     spread_minus: float
     eta: float = 0.0
     relaxation: Terms = ()
-
-    stiffening, softening, weakening = 1.0, 0.0, 0.0
+    stiffening: float = 1.0
+    softening: float = 0.0
+    weakening: float = 0.0
 
     def strain(self, s: float) -> float:
         """Return the strain at a stress of the first loading."""
-        on_a, on_c = s / (self.k0 + s), self.eps_star + s / (self.kc + s)
+        on_a = 1.0 - (1.0 + self.stiffening * s / self.k0) ** (-1.0 / self.stiffening)
+        on_c = self.eps_star + s / (self.kc + s)
         z = math.log(s / self.sigma_plus) / self.spread_plus if s > 0.0 else -math.inf
         return on_a + 0.5 * math.erfc(-z / math.sqrt(2.0)) * (on_c - on_a)
 
@@ -142,8 +144,7 @@ class Rig:
     velocity: float = 0.0
     gravity: float = 0.0
     motion: Motion | None = None
-
-    site_damping = 0.0
+    site_damping: float = 0.0  # Pa s, between striker and base
 
     @property
     def masses(self) -> list[float]:

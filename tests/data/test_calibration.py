@@ -1,13 +1,12 @@
 """Contradictions between velocity, mass, force and motion, in records of a simulated rig."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import rig
-import truth
 from conftest import DATA, needs_data, run
 from foamfit.data.calibration import balance, contradictions
 from foamfit.data.csv_file import read_test
@@ -61,10 +60,7 @@ def with_damper(seed: int) -> tuple[rig.Record, float]:
     peak = float(undamped.stress(np.linspace(0.0, undamped.end, 500)).max())
     eta = 0.3 * peak * undamped.rig.height / undamped.rig.velocity
 
-    class Damped(truth.Rig):
-        site_damping = eta
-
-    damped = Damped(**{one.name: getattr(undamped.rig, one.name) for one in fields(truth.Rig)})
+    damped = replace(undamped.rig, site_damping=eta)
     course = damped.run(0.0, 100.0 * damped.height / damped.velocity)
     return rig.recorded(rig.Impact(), course, seed), eta
 

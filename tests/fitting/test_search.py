@@ -268,10 +268,10 @@ def test_one_spring_follows_the_first_cycle_of_a_shoe_foam(name, tmp_path):
 def test_a_wrong_minimum_is_left_where_more_than_noise_is_missed(given, seed, tmp_path):
     """Wrong minima have long relaxation times and soft springs, or a short branch without slope."""
     test = ff.read_test(rig.write(made := rig.slow(given, seed), tmp_path))
-    params = ff.make_params(test, made.model, "displacement", relaxation=given.relaxation)
+    params = ff.make_params(test, given.law, "displacement", relaxation=given.relaxation)
     params["s1_eta"].vary = given.dashpot
     options = {"relaxation": given.relaxation, "intervals": "local"}
-    result = ff.fit(test, model=made.model, params=params, **options)
+    result = ff.fit(test, model=given.law, params=params, **options)
     assert result.noise["stress_strain"]["residual_over_noise"] < 1.1
     for name in ("s1_k0", "s1_kc", "s1_eta"):
         assert result.parameters[name].value == pytest.approx(made.truth[name], rel=0.1)
