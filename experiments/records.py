@@ -6,7 +6,6 @@ are read with `cycle` or `cycles`; "turbo-comp-1 cycles" are those of turbo-comp
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pandas as pd
@@ -85,15 +84,6 @@ def place(name: str, folder: Path, data: Path | None = None) -> Path:
         path.symlink_to((data / file).resolve())
     path.with_suffix(".toml").write_text(f'name = "{name}"\n{toml}', encoding="utf-8")
     return path
-
-
-@contextmanager
-def placed(*names: str) -> Iterator[Path]:
-    """Yield a temporary folder with some records."""
-    with studies.workplace() as folder:
-        for name in names:
-            place(name, folder)
-        yield folder
 
 
 def first_cycles(folder: Path) -> Iterator[ff.Measurement]:

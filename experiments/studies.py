@@ -11,6 +11,7 @@ import argparse
 import os
 import platform
 import re
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -91,6 +92,22 @@ def timed(work: Callable[..., Any], *given: Any, **options: Any) -> tuple[Any, f
     return work(*given, **options), time.process_time() - began
 
 
+def run(command: Sequence[Any], **options: Any) -> tuple[str, float, float, float]:
+    """Run a command; return its output, wall and processor time (s) and peak memory (MiB).
+
+    The memory is that of its largest process.
+    """
+    began, words = time.perf_counter(), list(map(str, command))
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, **options) as process:
+        output = process.stdout.read() if process.stdout else ""
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, words)
+    wall = time.perf_counter() - began
+    return output, wall, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024.0
+
+
 @contextmanager
 def workplace() -> Iterator[Path]:
     """Yield a temporary folder."""
@@ -137,12 +154,10 @@ def write_csv(
     rows: Iterable[Mapping[str, Any]] | pd.DataFrame, path: Path, digits: int = 4
 ) -> None:
     """Write rows, or a DataFrame, with `digits` significant digits; compressed if named .gz."""
-    frame = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows))
     raw: Any = {"method": "gzip", "mtime": 0} if path.suffix == ".gz" else None
     path.parent.mkdir(parents=True, exist_ok=True)
-    frame.to_csv(
-        path, index=False, float_format=f"%.{digits}g", lineterminator="\n", compression=raw
-    )
+    options: dict[str, Any] = {"float_format": f"%.{digits}g", "lineterminator": "\n"}
+    pd.DataFrame(rows).to_csv(path, index=False, compression=raw, **options)
 
 
 def write_page(folder: Path, out: Path | None = None, **values: Any) -> str:
@@ -166,13 +181,6 @@ def circumstances(*packages: str) -> str:
     used = ", ".join(f"{package} {version(package)}" for package in packages)
     machine = f"{name} ({platform.machine()}, {os.cpu_count()} cores)"
     return f"{machine}; Python {platform.python_version()}, {used}"
-
-
-def counted(states: pd.Series) -> str:
-    """Return how many parameters are determined, weak and not determined."""
-    return " / ".join(
-        str((states == one).sum()) for one in ("determined", "weak", "not determined")
-    )
 
 
 def share(hits: Sequence[bool]) -> dict[str, float]:

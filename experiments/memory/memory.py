@@ -7,6 +7,7 @@ memory.png.
 """
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,33 +46,26 @@ def misfits(test: ff.Measurement, result: Fit) -> dict[int, float]:
     }
 
 
-def study() -> None:
-    """Fit and predict; the table is written row by row."""
-    rows = list[dict[str, Any]]()
-
-    def add(test: str, what: str, more: list[dict[str, Any]]) -> None:
-        rows.extend({"test": test, "what": what} | row for row in more)
-        studies.write_csv(rows, TABLE)
-        print(test, what, *(f"{100.0 * row['misfit']:.2f} %" for row in more), flush=True)
-
-    with studies.workplace() as folder:
-        for test in records.first_cycles(folder):
-            result, seconds = studies.timed(ff.fit, test, **MEMORY, relaxation=1)
-            miss = misfits(test, result)[test.cycle]
-            row = {"cycle": 1, "misfit": miss, "inside": np.nan, "seconds": seconds}
-            add(test.name, FIRST, [row])
-        for name in ("turbo-comp-1 cycles", *HEELS):
-            file, specimen = records.place(name, folder), name.removesuffix(" cycles")
-            test = ff.read_test(file, cycles=(1, 3))
-            result, seconds = studies.timed(ff.fit, test, **MEMORY, relaxation=2)
-            later = ff.predict(result, ff.read_test(file, cycles=(1, 5)))
-            whole = {"cycle": "1-3", "misfit": result.misfit["stress_strain"], "seconds": seconds}
-            each = [{"cycle": n, "misfit": m} for n, m in misfits(test, result).items()]
-            add(specimen, HISTORY, [whole, *each])
-            cycles = [{"cycle": n, **one} for n, one in later.by_cycle.items() if n > 3]
-            add(specimen, PREDICTED, cycles)
-            if specimen == SHOWN:
-                plot_prediction(later).savefig(HERE / "memory.png", dpi=200)
+def fits(folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield a row for each fitted or predicted cycle, and for three cycles as one history."""
+    for test in records.first_cycles(folder):
+        result, seconds = studies.timed(ff.fit, test, **MEMORY, relaxation=1)
+        miss = misfits(test, result)[test.cycle]
+        row = {"test": test.name, "what": FIRST, "cycle": 1, "misfit": miss, "inside": np.nan}
+        yield row | {"seconds": seconds}
+    for name in ("turbo-comp-1 cycles", *HEELS):
+        file, specimen = records.place(name, folder), name.removesuffix(" cycles")
+        about, test = {"test": specimen, "what": HISTORY}, ff.read_test(file, cycles=(1, 3))
+        result, seconds = studies.timed(ff.fit, test, **MEMORY, relaxation=2)
+        later = ff.predict(result, ff.read_test(file, cycles=(1, 5)))
+        whole = {"cycle": "1-3", "misfit": result.misfit["stress_strain"], "seconds": seconds}
+        yield about | whole
+        yield from (about | {"cycle": n, "misfit": m} for n, m in misfits(test, result).items())
+        for number, one in later.by_cycle.items():
+            if number > 3:
+                yield about | {"what": PREDICTED, "cycle": number, **one}
+        if specimen == SHOWN:
+            plot_prediction(later).savefig(HERE / "memory.png", dpi=200)
 
 
 def summary(table: pd.DataFrame) -> str:
@@ -111,7 +105,8 @@ def coverage(predicted: pd.DataFrame) -> str:
 def main() -> None:
     if not studies.arguments(__doc__, page=True).parse_args().page:
         studies.measurements("shoe-foam", "shoe-foam-twins")
-        study()
+        with studies.workplace() as folder:
+            studies.write_csv(studies.said(fits(folder)), TABLE)
     table = pd.read_csv(TABLE)
     took = table[table["what"] == HISTORY]["seconds"].dropna()
     studies.write_page(

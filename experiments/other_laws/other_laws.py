@@ -5,7 +5,6 @@ Method and answer: README.md. Also written: other_laws.csv (a row per fit) and o
     FOAMFIT_DATA=… python experiments/other_laws/other_laws.py    # --jobs 2 is faster
 """
 
-import argparse
 import importlib
 import re
 import sys
@@ -164,32 +163,26 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def main() -> None:
-    """Fit, and write page, table and figure."""
+    """Fit all tests; write page, table and figure."""
     numbers = {"starts": (6, "descents of each fit"), "jobs": (1, "processes")}
     parser = studies.arguments(__doc__, HERE, page=True, **numbers)
     parser.add_argument("--only", default="", help="tests whose name contains this")
     given = parser.parse_args()
     if not given.page:
-        fit_tests(given)
-    table = pd.read_csv(given.out / "other_laws.csv")
-    studies.write_page(
-        HERE, out=given.out, table=law_table(table), rows=ROWS,
-        starts=given.starts, minutes=f"{table['seconds'].sum() / 60.0:.0f}",
-    )  # fmt: skip
-
-
-def fit_tests(given: argparse.Namespace) -> None:
-    """Fit all tests; write the table and the figure."""
-    studies.measurements(
-        "shoe-foam", "shoe-foam-twins", "mycelium-rates", "lattice-cycles", "cartilage-impact"
-    )
-    rows = list[dict[str, Any]]()
-    jobs = [(case, given.starts) for case in TESTS if given.only in case[1]]
+        folders = ("shoe-foam", "shoe-foam-twins", "mycelium-rates", "lattice-cycles")
+        studies.measurements(*folders, "cartilage-impact")
+    cases, rows = [case for case in TESTS if given.only in case[1]], list[dict[str, Any]]()
+    jobs = [] if given.page else [(case, given.starts) for case in cases]
     for more in studies.in_order(fit_all, jobs, given.jobs):
         rows += more  # an interrupted study keeps its rows
         table = pd.DataFrame(rows).drop(columns="curves")
         studies.write_csv(table, given.out / "other_laws.csv")
         draw(rows, given.out / "other_laws.png")
+    table = pd.read_csv(given.out / "other_laws.csv")
+    studies.write_page(
+        HERE, out=given.out, table=law_table(table), rows=ROWS,
+        starts=given.starts, minutes=f"{table['seconds'].sum() / 60.0:.0f}",
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

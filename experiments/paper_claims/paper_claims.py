@@ -9,11 +9,11 @@ Method and answers: README.md, every number of which is computed here from the p
 import math
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import bisect
 
 import foamfit as ff
 from foamfit.springs import laws
@@ -82,18 +82,14 @@ def struck(chain: ff.Chain, velocity: float, samples: int = 101) -> ff.Response:
     return got
 
 
-def least(enough: Callable[[float], bool], low: float, high: float, close: float) -> float:
-    """Return the least value, to within `close`, that is enough: not `low`, but `high`."""
-    while high - low > close:
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if enough(middle) else (middle, high)
-    return high
-
-
 def closing_velocity(name: str, interior: bool = True) -> float:
     """Return the least velocity (m/s) at which the impact reaches branch c."""
     chain, c = impact_scene(name, interior), [*laws.law("bistable").branches].index("c")
-    return least(lambda v: bool(np.any(struck(chain, v).switches[:, 3] == c)), 1.0, 8.0, 1e-6)
+
+    def reaches(velocity: float) -> float:
+        return 0.5 if np.any(struck(chain, velocity).switches[:, 3] == c) else -0.5
+
+    return float(bisect(reaches, 1.0, 8.0, xtol=1e-6))
 
 
 def work_to_c1(name: str) -> float:

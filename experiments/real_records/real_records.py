@@ -24,8 +24,15 @@ from studies import Array
 
 HERE = Path(__file__).parent
 
-MODELS = {"bistable": 0, "microscale": 1}  # and the number of relaxation terms
-LAWS = {"bistable": "bistable", "microscale": "microscale, relaxation"}  # in the tables
+# Laws by their names in the tables: model and number of relaxation terms.
+LAWS = {"bistable": ("bistable", 0), "microscale, relaxation": ("microscale", 1)}
+# Values of a law in plain least squares: units (stiffness, stress, strain, time, none) and bounds.
+BOX = {  # k0, kc, −Δσ/σ_a, ε_a, ε_c − ε_a, k_h+, k_h−; k0, kc, ε_* beyond the least, snaps, g, τ
+    "bistable": ("kk1eekk", (0.03, 0.03, 1e-4, 0.02, 5e-3, 0.01, 1e-4),
+                 (30, 300, 0.999, 0.9, 0.8, 30, 30)),
+    "microscale": ("kk1s1s11t", (0.03, 0.01, 1e-3, 0.02, 0.05, 2e-3, 0.05, 0.01, 1e-3),
+                   (300, 100, 0.6, 3, 3, 1.5, 3, 5, 1)),
+}  # fmt: skip
 STARTS = 25
 SECONDS = 60.0
 
@@ -93,27 +100,19 @@ class Judge(NamedTuple):
                 yield f"misfit of {name} {100.0 * misfit:.0f} %"
 
 
-def bistable(values: Array, strain: Array, _: Array) -> Array:
-    """Stress of a bistable spring; values k0, kc, −Δσ/σ_a, ε_a, ε_c − ε_a, k_h+, k_h−."""
-    k0, kc, drop, eps_a, more, plus, minus = values
-    spring = ff.BistableSpring(
-        k0=k0, kc=kc, dsigma=-drop * k0 * eps_a / (1.0 - eps_a), eps_a=eps_a, eps_c=eps_a + more,
-        kh_plus=plus, kh_minus=minus,
-    )  # fmt: skip
-    return np.asarray(spring.stress(strain))
-
-
-def microscale(values: Array, strain: Array, instants: Array) -> Array:
-    """Stress of a microscale spring with one relaxation term; values as in the law, ε_* extra."""
-    k0, kc, extra, *snap, g, tau = values
+def stress_of(model: str, values: Array, strain: Array, instants: Array) -> Array:
+    """Return the stress of a law; values as in `BOX`."""
+    k0, kc, third, *rest = values
+    if model == "bistable":
+        eps_a, more, plus, minus = rest
+        dsigma = -third * k0 * eps_a / (1.0 - eps_a)
+        spring = ff.BistableSpring(k0, kc, dsigma, eps_a, eps_a + more, plus, minus)
+        return np.asarray(spring.stress(strain))
+    *snap, g, tau = rest
     least = max(0.0, (math.sqrt(kc) - math.sqrt(k0)) / (math.sqrt(kc) + math.sqrt(k0)))
-    names = ("sigma_plus", "spread_plus", "sigma_minus", "spread_minus")
-    spring = ff.MicroscaleSpring(
-        k0=k0, kc=kc, eps_star=least + extra, **dict(zip(names, snap, strict=True)),
-        relaxation=[(g, tau)],
-    )  # fmt: skip
+    relaxing = ff.MicroscaleSpring(k0, kc, least + third, *snap, relaxation=[(g, tau)])
     drive = ff.DisplacementDrive(strain)
-    return np.asarray(ff.simulate(ff.Chain([spring], [1.0], 1.0), drive, instants).base_stress)
+    return np.asarray(ff.simulate(ff.Chain([relaxing], [1.0], 1.0), drive, instants).base_stress)
 
 
 def plain_misfit(test: ff.Measurement, model: str, zero: float, *, starts: int = STARTS) -> float:
@@ -124,22 +123,14 @@ def plain_misfit(test: ff.Measurement, model: str, zero: float, *, starts: int =
     kept = test.sampled.get("stress", np.ones(strain.size, bool))
     if "stress" in test.outliers:
         kept = kept & ~test.outliers["stress"].left_out
-    size, most, lasts = float(test.stress.max()), float(strain.max()), float(np.ptp(instants))
-    stiff, span = size / most, float(np.ptp(test.stress))
-
-    if model == "bistable":
-        law, unit = bistable, [stiff, stiff, 1.0, most, most, stiff, stiff]
-        least = (0.03, 0.03, 1e-4, 0.02, 5e-3, 0.01, 1e-4)
-        largest = (30, 300, 0.999, 0.9, 0.8, 30, 30)
-    else:
-        law, unit = microscale, [stiff, stiff, 1.0, size, 1.0, size, 1.0, 1.0, lasts]
-        least = (0.03, 0.01, 1e-3, 0.02, 0.05, 2e-3, 0.05, 0.01, 1e-3)
-        largest = (300, 100, 0.6, 3, 3, 1.5, 3, 5, 1)
-    low, high = np.log(np.array([least, largest]) * unit)
+    size, most, span = float(test.stress.max()), float(strain.max()), float(np.ptp(test.stress))
+    units = {"k": size / most, "s": size, "e": most, "t": float(np.ptp(instants)), "1": 1.0}
+    kinds, *ends = BOX[model]
+    low, high = np.log(np.array(ends) * [units[kind] for kind in kinds])
 
     def residual(point: Array) -> Array:
         try:
-            return (law(np.exp(point), strain, instants) - test.stress)[kept] / span
+            return (stress_of(model, np.exp(point), strain, instants) - test.stress)[kept] / span
         except (ValueError, ff.SimulationError):
             return np.full(int(kept.sum()), 10.0)
 
@@ -160,7 +151,7 @@ def compared(folder: Path) -> Iterator[dict[str, object]]:
     for name in dict.fromkeys((*known, *others)):
         path, real = records.place(name, folder), known.get(name)
         test, judge = ff.read_test(path), Judge.of(real, path) if real else None
-        for model, terms in MODELS.items():
+        for law, (model, terms) in LAWS.items():
             result, seconds = studies.timed(ff.fit, test, model=model, relaxation=terms)
             assert result.drive == "displacement"
             wrong = list(judge.excluded(result, real.height)) if judge else ["not judged"]
@@ -172,7 +163,7 @@ def compared(folder: Path) -> Iterator[dict[str, object]]:
             found = result.parameters.items()
             states = [p.state for n, p in found if n.startswith("s1_")]
             yield {
-                "record": name, "law": LAWS[model], "fit (%)": 100.0 * own,
+                "record": name, "law": law, "fit (%)": 100.0 * own,
                 "plain (%)": 100.0 * other, "fit over plain": own / other,
                 "determined": states.count("determined"),
                 "held by the record": ", ".join(n for n, p in found if "record shows" in p.why),

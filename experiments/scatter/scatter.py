@@ -85,7 +85,9 @@ def page(frame: pd.DataFrame) -> None:
 def main() -> None:
     if not studies.arguments(__doc__, page=True).parse_args().page:
         studies.measurements("shoe-foam-twins")
-        with records.placed(*records.HEELS) as folder:
+        with studies.workplace() as folder:
+            for name in records.HEELS:
+                records.place(name, folder)
             cases = product(GROUPS, range(1, COUNT + 1))
             frame = studies.said(predicted(folder, group, left) for group, left in cases)
         studies.write_csv(frame, HERE / "scatter.csv", 5)

@@ -9,13 +9,11 @@ functions.
 """
 
 import os
-import resource
 import statistics
-import subprocess
 import sys
-import time
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 import foamfit as ff
 
@@ -40,31 +38,23 @@ PROBE = (  # garbage is collected as in the command
 )
 
 
-def run(command: list[str], **variables: str) -> tuple[float, float, str]:
-    """Run a command; return wall and processor time (s) and output."""
-    own = os.environ | {"MPLBACKEND": "Agg"} | variables
-    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    done = subprocess.run(command, check=True, env=own, capture_output=True, text=True)
-    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
-    return wall, sum(after[:2]) - sum(before[:2]), done.stdout  # user and system
-
-
 def measure(test: Path, first: int, warm: int) -> dict[str, float]:
-    """Return medians of first use, warm use, its processor time, and the parts."""
-    out = str(test.parent / "result")
-    fit = [sys.executable, "-m", "foamfit", "fit", str(test), "--quiet", "--out", out]
-    probe = [sys.executable, "-c", PROBE, str(test), out]
+    """Return medians of first use, warm use, its processor time and memory, and the parts."""
+    out, own = test.parent / "result", os.environ | {"MPLBACKEND": "Agg"}
+    fit = [sys.executable, "-m", "foamfit", "fit", test, "--quiet", "--out", out]
+    probe = [sys.executable, "-c", PROBE, test, out]
     found = defaultdict[str, list[float]](list)
     for _ in range(first):
         with studies.workplace() as cache:
-            wall = run(fit, NUMBA_CACHE_DIR=str(cache))[0]
+            wall = studies.run(fit, env=own | {"NUMBA_CACHE_DIR": str(cache)})[1]
         found[f"first use, from command to report (median of {first})"].append(wall)
-    run(fit)  # compiles the rest
+    studies.run(fit, env=own)  # compiles the rest
     for _ in range(warm):
-        wall, used, _ = run(fit)
+        _, wall, used, peak = studies.run(fit, env=own)
         found[f"warm, from command to report (median of {warm})"].append(wall)
         found["processor time of its first process"].append(used)
-        wall, _, printed = run(probe)
+        found["peak memory"].append(peak)
+        printed, wall, *_ = studies.run(probe, env=own)
         parts = [float(part) for part in printed.split()]
         for name, part in zip(PARTS, [wall - sum(parts[1:]), *parts[1:]], strict=True):
             found[f"– {name}"].append(part)
@@ -72,22 +62,15 @@ def measure(test: Path, first: int, warm: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = studies.arguments(
-        __doc__,
-        HERE,
-        rows=reconstruct.ROWS,
-        first=(3, "fits at first use"),
-        warm=(9, "fits once compiled"),
-    )
-    options = parser.parse_args()
+    counts: dict[str, Any] = {"first": (3, "fits at first use"), "warm": (9, "once compiled")}
+    options = studies.arguments(__doc__, HERE, rows=reconstruct.ROWS, **counts).parse_args()
     with studies.workplace() as folder:
         test = reconstruct.write(ff.published["foam-1/model-1"], 2.0, folder, options.rows)
         measured = measure(test, options.first, options.warm)
+    peak = measured.pop("peak memory")
     rows = ((name, f"{seconds:.2f}") for name, seconds in measured.items())
     table = studies.markdown([f"{options.rows} rows", "wall time (s)"], rows)
-    print(table)
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-    print(f"peak memory {peak:.0f} MiB")
+    print(table, f"peak memory {peak:.0f} MiB", sep="\n")
     if options.rows == reconstruct.ROWS:
         machine = f"{os.cpu_count()} cores, {studies.circumstances()}"
         studies.write_page(HERE, options.out, table=table, circumstances=machine)
