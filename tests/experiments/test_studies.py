@@ -42,6 +42,7 @@ def test_impacts_are_those_of_foamfit(law: str, relaxation: int, seed: int, grav
         rig.Slow(relaxation=2, motion="ramp", early=True),
         rig.Slow(relaxation=1, motion="sine"),
         rig.Slow(dashpot=True, relaxation=1),
+        rig.Slow(relaxation=1, cycles=3),
     ],
 )
 @pytest.mark.parametrize("seed", [1, 2])
