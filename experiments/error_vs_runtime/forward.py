@@ -6,7 +6,6 @@ table and a figure per scene and summary.csv go to `forward/`.
 
     python experiments/error_vs_runtime/forward.py                      # all: about 5 minutes
     python experiments/error_vs_runtime/forward.py one_spring_impact    # some scenes, no page
-    python experiments/error_vs_runtime/forward.py --scaling            # prints ns by size
 """
 
 import math
@@ -16,7 +15,6 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.util import find_spec
-from itertools import product
 from pathlib import Path
 from timeit import timeit
 from typing import Any, NamedTuple
@@ -45,12 +43,10 @@ HEIGHT, AREA = MODEL_2.chain.height, MODEL_2.chain.area
 
 PUBLIC, KERNEL, SCIPY, HEYOKA = "foamfit simulate", "foamfit kernel", "SciPy", "heyoka"
 WANTED = 2e-6  # the error at which solvers are compared
-ROUNDS, BUDGET = 40, 6.0  # turns, and seconds of turns of a scene
+ROUNDS = 15  # turns of all solvers of a scene
 SHORTEST = 2e-3  # s; shorter runs are timed in groups
 BRIEF = 1e-2  # s; shorter runs are preceded by an untimed run
-SLOW = 1.0  # s; longer runs are made once
 FLOOR = 1e-16  # a zero error is drawn here
-SIZES = [*((count, SAMPLES) for count in (1, 10, 100, 1000)), *((1, 10**k) for k in range(2, 6))]
 TIMES = ["median (s)", "lower quartile (s)", "upper quartile (s)"]
 # Markers also distinguish solvers, besides colours.
 SOLVERS: dict[str, dict[str, Any]] = {
@@ -198,6 +194,12 @@ def seconds(run: Callable[[], object], times: int = 1) -> float:
 def measure(scene: Scene) -> pd.DataFrame:
     """Return error and time of every solver in a scene at every tolerance; they take turns."""
     truth, found = reference(scene), list[tuple[dict[str, Any], Callable[[], Answer], float]]()
+
+    def timed(run: Callable[[], Answer], first: float) -> float:
+        if first < BRIEF:  # the previous run has displaced the caches
+            run()
+        return seconds(run, max(1, round(SHORTEST / first)))
+
     for solver, runs in solvers(scene).items():
         for tolerance, run in runs.items():
             try:
@@ -209,19 +211,9 @@ def measure(scene: Scene) -> pd.DataFrame:
                 found.append((about, run, first))
             if first > scene.longest:
                 break
-    took: list[list[float]] = [[first] if first > SLOW else [] for *_, first in found]
-    for turn, ((_, run, first), times) in product(range(ROUNDS), zip(found, took, strict=True)):
-        together = max(1, round(SHORTEST / first))
-        rest = round(ROUNDS * first * together * len(found) / BUDGET)  # turns that a slow one skips
-        if first <= SLOW and turn % min(max(rest, 1), ROUNDS // 3) == 0:
-            if first < BRIEF:  # the previous run has displaced the caches
-                run()
-            times.append(seconds(run, together))
-    quartiles = (np.percentile(times, [50, 25, 75]) for times in took)
-    return pd.DataFrame(
-        about | dict(zip(TIMES, three, strict=True))
-        for (about, *_), three in zip(found, quartiles, strict=True)
-    )
+    took = [[timed(run, first) for _, run, first in found] for _ in range(ROUNDS)]
+    quartiles = pd.DataFrame(np.percentile(took, [50, 25, 75], axis=0).T, columns=TIMES)
+    return pd.DataFrame(about for about, *_ in found).join(quartiles)
 
 
 def draw_scene(table: pd.DataFrame, title: str, path: Path) -> None:
@@ -249,27 +241,6 @@ def draw_scene(table: pd.DataFrame, title: str, path: Path) -> None:
         figure.legend(loc="outside right center")
 
 
-def scaling() -> pd.DataFrame:
-    """Return the kernel's time per sample and spring, ns, for many springs or many samples."""
-    spring, rows = MODEL_2.bistable, list[dict[str, Any]]()
-    for count, samples in SIZES:
-        time, half = np.linspace(0.0, LENGTH, samples), np.linspace(0.0, 1.0, samples) < 0.5
-        wave = np.sin(np.pi * np.linspace(0.0, 1.0, samples))
-        loop = np.where(half, wave**2, wave**4)  # past C1 and back
-        drives = {
-            "stress": ff.StressDrive(1.15 * spring.sigma_hat_c * loop),
-            "displacement": ff.DisplacementDrive(1.05 * spring.eps_hat_c * HEIGHT * loop),
-            "impact": ff.Impact(MASS, 2.2),
-        }
-        rows.append({"springs": count, "samples": samples})
-        for name, drive in drives.items():
-            run = kernel(graded(count), drive, time)
-            run()
-            took = np.median([seconds(run) for _ in range(3 if count == 1000 else 20)])
-            rows[-1][name] = 1e9 * float(took) / (count * samples)
-    return pd.DataFrame(rows)
-
-
 def compare(scene: Scene, table: pd.DataFrame) -> dict[str, object]:
     """Return one row of the summary: the fastest setting of each solver with an error < WANTED."""
     reached, row = table[table["error"] < WANTED], dict[str, object](scene=scene.title)
@@ -286,12 +257,8 @@ def main() -> None:
     """Measure and draw the scenes; write the page if all were asked for."""
     parser = studies.arguments(__doc__, HERE)
     parser.add_argument("scenes", nargs="*", help="names; left out = all, and the page")
-    parser.add_argument("--scaling", action="store_true", help="time by springs and samples alone")
     options = parser.parse_args()
     threadpool_limits(1)  # processor time of one thread
-    if options.scaling:
-        print(studies.shown(scaling()))
-        return
     folder, rows, figures = options.out / "forward", list[dict[str, object]](), list[str]()
     folder.mkdir(parents=True, exist_ok=True)
     for scene in scenes():
