@@ -18,6 +18,7 @@ import foamfit as ff
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import studies
+from joint import SHARED, SPRING, write_study, write_test
 from rig import Impact, Slow, impact, slow, write
 
 HERE = Path(__file__).parent
@@ -50,8 +51,6 @@ FITS = {  # reconstruction: model, drive
     "foam-2/4.5mps": ("linear+bistable", "impact"),
     "foam-2/4.44mps": ("microscale", "displacement"),
 }
-SHARED = ("k0", "kc", "eps_star", "spread_plus", "sigma_minus", "spread_minus")
-KINDS = dict.fromkeys(SHARED, "shared") | {"sigma_plus": "scatter"}
 
 
 def of_fit(name: str, result: ff.FitResult) -> Iterator[Row]:
@@ -73,7 +72,7 @@ def fits(folder: Path) -> Iterator[Row]:
         record = impact(setup, 4001) if isinstance(setup, Impact) else slow(setup, 4001)
         (place := folder / name).mkdir()
         test = ff.read_test(write(record, place))
-        yield from of_fit(name, ff.fit(test, model=record.model, relaxation=setup.relaxation))
+        yield from of_fit(name, ff.fit(test, model=setup.law, relaxation=setup.relaxation))
 
 
 def simulations() -> Iterator[Row]:
@@ -101,28 +100,18 @@ def simulations() -> Iterator[Row]:
 
 
 def together(folder: Path) -> Iterator[Row]:
-    """Yield numbers of a joint fit of three synthetic loops and the prediction of a fourth."""
-    time = np.linspace(0.0, 2.0, 201)
-    moved = 5e-3 * (1.0 - np.abs(time - 1.0))
+    """Yield numbers of a joint fit of three synthetic tests and the prediction of a fourth."""
     rng = np.random.default_rng(5)
-    for i, factor in enumerate((0.9, 1.0, 1.1, 1.04)):
-        spring = ff.MicroscaleSpring(5e5, 4e5, 0.1, 1e5 * factor, 0.35, 5e4, 0.6)
-        stress = ff.simulate(ff.Chain([spring], [1e-2], 1e-4), ff.DisplacementDrive(moved), time)
-        noisy = stress.base_stress + 300.0 * rng.standard_normal(time.size)
-        path = folder / (f"loop-{i}.csv" if i < 3 else "other.csv")
-        text = '[specimen]\nheight = "10 mm"\narea = "100 mm^2"\n[noise]\nstress = "300 Pa"\n'
-        table = {"time (s)": time, "displacement (mm)": 1e3 * moved, "stress (kPa)": noisy / 1e3}
-        pd.DataFrame(table).to_csv(path, index=False, float_format="%.9g")
-        path.with_suffix(".toml").write_text(text, encoding="utf-8")
-    study = studies.write_study(
-        folder / "STUDY.toml", ["loop-*.csv"], "microscale", KINDS, drive="displacement"
-    )
-    found = ff.joint(study)
+    for name, factor in {"t0": 0.9, "t1": 1.0, "t2": 1.1, "other": 1.04}.items():
+        onset = factor * SPRING["sigma_plus"]
+        write_test(folder / f"{name}.csv", 0.1, rng, sigma_plus=onset)
+    found = ff.joint(write_study(folder, SHARED | {"sigma_plus": "scatter"}))
     for name, one in found.parameters.items():
         yield "joint", f"{name} value", one.value
         if one.ci95 is not None:
             yield "joint", f"{name} stderr", float(one.ci95[1] - one.ci95[0]) / 3.92
-    for curve, one in ff.predict(found, folder / "other.csv").curves.items():
+    other = ff.read_test(folder / "other.csv", folder / "foam.toml")
+    for curve, one in ff.predict(found, other).curves.items():
         yield "prediction", f"inside {curve}", one.inside
         yield "prediction", f"band {curve}", one.half_width
 
