@@ -7,12 +7,9 @@ reconstruction of foam-1.
     python experiments/batch/batch.py overhead      # one of them; see MEASURES
 """
 
-import contextlib
 import json
 import os
-import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -48,27 +45,6 @@ def size_of(folder: Path) -> dict[str, float]:
     return {"files": len(sizes), "kB": sum(sizes) / 1e3}
 
 
-def run(place: Path, *words: object) -> tuple[float, list[tuple[int, float, float]]]:
-    """Run the command; return its processor time, and its memory ten times a second.
-
-    Each entry of the memory is the number of result folders, and the MiB of the command and of its
-    largest process.
-    """
-    import psutil
-
-    sizes, used = list[tuple[int, float, float]](), os.times()
-    command = [sys.executable, "-m", "foamfit", "batch", "tests", "--specimen", "foam.toml"]
-    with subprocess.Popen([*command, "--quiet", *map(str, words)], cwd=place) as process:
-        whole = psutil.Process(process.pid)
-        while process.poll() is None:
-            time.sleep(0.1)
-            with contextlib.suppress(psutil.Error, OSError):
-                below = [one.memory_info().rss for one in whole.children(recursive=True)]
-                each = (whole.memory_info().rss, max(below, default=0))
-                sizes.append((len(os.listdir(place / "out")), *(rss / 2**20 for rss in each)))
-    return sum(os.times()[2:4]) - sum(used[2:4]), sizes
-
-
 def measure_overhead(place: Path) -> dict[str, Any]:
     """Measure the overhead per test (read, compare, write), and the size of a result folder."""
     make_tests(place / "tests", TINY)
@@ -92,15 +68,15 @@ def measure_overhead(place: Path) -> dict[str, Any]:
 
 
 def measure_memory(place: Path) -> dict[str, Any]:
-    """Measure the resident memory of the processes during a batch of many tests."""
-    make_tests(place / "tests", MANY, linear=True)
+    """Measure the memory of the largest process of a batch, and the time of a second run."""
     words = ("--starts", 1, "--model", "linear", "--drive", "displacement", "--no-report")
-    words += ("--jobs", 2, "--out", "out")
-    sizes, at = run(place, *words)[1], {}
-    for wanted in (100, 500, MANY - 20):
-        done, main, worker = min(sizes, key=lambda s, w=wanted: abs(s[0] - w))
-        at[str(wanted)] = {"done": done, "command_MiB": main, "largest_process_MiB": worker}
-    return {"tests": MANY, "after": at, "again_cpu_s": run(place, *words)[0]}
+    command, found = [sys.executable, "-m", "foamfit", "batch", *words, "--quiet"], {}
+    command += ["--jobs", 2, "--specimen", "foam.toml"]
+    for count in (MANY // 10, MANY):
+        make_tests(place / f"t{count}", count, linear=True)
+        one = [*command, f"t{count}", "--out", f"out{count}"]
+        found[f"peak_MiB_{count}"] = studies.run(one, cwd=place)[3]
+    return found | {"again_cpu_s": studies.run(one, cwd=place)[2]}
 
 
 MEASURES = {"overhead": measure_overhead, "memory": measure_memory}
