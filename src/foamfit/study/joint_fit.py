@@ -260,7 +260,7 @@ def _held(point: JointPoint, name: str, sign: float) -> float:
             continue
         if cost - found.cost <= rise:
             return end
-        change = abs(end - value) * nearer(rise, cost - found.cost, 0.8)
+        change = abs(end - value) * nearer(rise, cost - found.cost)
     return value
 
 

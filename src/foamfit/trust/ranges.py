@@ -123,10 +123,10 @@ def _held(refit: Refit, side: int, along: Array, most: float) -> list[Array]:
         found = refit.descend(refit.space.encode(moved), held, ITERATIONS)
         if found.cost - best.cost <= most:
             return [refit.values(found)]
-        shift *= nearer(most, found.cost - best.cost, 0.8)
+        shift *= nearer(most, found.cost - best.cost)
     return []
 
 
-def nearer(most: float, rise: float, largest: float) -> float:
+def nearer(most: float, rise: float) -> float:
     """Return the factor for a step whose rise was too large; the rise is about quadratic."""
-    return min(max(math.sqrt(most / rise), 0.3), largest) if math.isfinite(rise) else 0.5
+    return min(max(math.sqrt(most / rise), 0.3), 0.8) if math.isfinite(rise) else 0.5
