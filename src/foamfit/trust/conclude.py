@@ -221,6 +221,7 @@ def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict
     """Return what makes all determined parameters weak, for the sentence of `why.weak`."""
     test, model = best.problem.measurement, best.problem.model
     objective, errs = best.problem.objective, bool(best.names) and best.misfits
+    several = [name for name in best.names if len(model.kinds) > 1 and name not in NUISANCE]
     assert test.stress is not None
     ended = float(test.stress[-3:].mean() / test.stress.max())
     misfit, curve = max((objective.off(best.simulated, n) or 0.0, n) for n in objective.counted)
@@ -234,9 +235,16 @@ def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict
         "lost": lost_height(best),
         "stayed": test.last_cycle is None and test.start_strain != 0.0 and _is_closed(best),
         "alone": errs and not (record.stopped or record.led) and 0 < record.agreeing < 2,
+        "cornered": next((name for name in several if errs and _is_at_limit(best, name)), ""),
         "off": misfit if misfit > POOR else 0.0,
         "curve": curve,
     }
+
+
+def _is_at_limit(best: BestPoint, name: str) -> bool:
+    """Return whether a parameter lies at a limit other than zero."""
+    near = covariance.AT_LIMIT * best.size(name)
+    return any(limit and abs(best.value(name) - limit) <= near for limit in best.limits(name))
 
 
 def _is_closed(best: BestPoint) -> bool:
