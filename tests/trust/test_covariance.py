@@ -58,13 +58,14 @@ def test_each_curve_has_its_own_noise():
     assert spread.stderr[1] / spread.stderr[0] == pytest.approx(10.0, rel=0.1)
 
 
-def test_an_error_of_a_held_parameter_is_added():
+@pytest.mark.parametrize("source", ["shifts", "modes"])
+def test_an_error_of_a_held_parameter_or_of_the_motion_is_added(source):
     """A mean of n values, all of which are off by one normal error."""
     rng, n, off = np.random.default_rng(1), 400, 0.3
     residual = rng.standard_normal(n)
     residual -= residual.mean()
     mean, noise = np.ones((n, 1)), NoiseProcess(np.zeros(0), 1.0)
-    block = Block(mean, (n,), [noise], np.eye(1), shifts=np.full((n, 1), off))
+    block = Block(mean, (n,), [noise], np.eye(1), **{source: np.full((n, 1), off)})
     found = Uncertainty((block,), np.ones(1)).covariance
     assert found.stderr[0] == pytest.approx(np.hypot(1.0 / np.sqrt(n), off), rel=1e-3)
 

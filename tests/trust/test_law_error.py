@@ -159,13 +159,6 @@ def strikes(kind: str) -> Problem:
     return make_problem(test, "bistable", "impact", None, None, False)
 
 
-def truth(problem: Problem) -> np.ndarray:
-    """Return the values of the study's spring without dashpots, with known contact and zeros."""
-    values = problem.vector()
-    values[:9] = *law_error.SPRING.seven, 0.0, 0.0
-    return values
-
-
 def refitted(problem: Problem, values: np.ndarray, names: tuple[str, ...]) -> BestPoint:
     refit = Refit(BestPoint(problem, values, names), Tracker(problem.objective))
     end = refit.descend(refit.space.encode(values), refit.box, 40)
@@ -181,8 +174,9 @@ def test_the_interval_holds_the_best_fit_without_noise(kind):
     """
     assert binom.cdf(14, 20, 0.95) < 1e-3
     clean = strikes(kind)
-    names = clean.free()[:7]
-    best = refitted(clean, truth(clean), names)
+    names, start = clean.free()[:7], clean.vector()
+    start[:9] = *law_error.SPRING.seven, 0.0, 0.0  # contact and zeros are known
+    best = refitted(clean, start, names)
     column, at = names.index("s1_kc"), best.index["s1_kc"]
     values, halves, found, old = [], [], 0, []
     for draw in range(20):
@@ -231,12 +225,10 @@ def test_every_description_in_the_range_follows_the_curves_about_as_well():
 
 
 def test_the_result_says_what_was_decided(tmp_path):
-    result, best, _ = fitted(0)
+    result, *_ = fitted(0)
     told = result.noise["stress_strain"]
     assert told["law_error_evidence"] > 10.0
-    missed = result.misfit["stress_strain"] * np.ptp(
-        best.problem.objective.measured["stress_strain"]
-    )
+    missed = result.misfit["stress_strain"] * told["range"]
     assert told["law_error"] == pytest.approx(missed, rel=0.1)
     (check,) = [check for check in result.checklist if check.key == "noise"]
     assert check.answer is False
@@ -250,16 +242,22 @@ def test_the_result_says_what_was_decided(tmp_path):
     assert all(line.replace("'", "&#39;") in report for line in RULE)
 
 
+def test_a_fit_that_errs_is_not_weighed_by_the_noise_of_its_motion():
+    """Such weights moved k_c by 1 %, which is twice its interval."""
+    test, rng = micro(0), np.random.default_rng(1)
+    noisy = test.displacement + 0.003 * np.ptp(test.displacement) * rng.standard_normal(465)
+    found = ff.fit(replace(test, displacement=noisy, noise=Noise()), starts=4, intervals="local")
+    assert found.weighed_at == ()
+
+
 @pytest.mark.parametrize("friction", [0.0, 0.01])
 def test_there_is_no_range_where_the_law_follows_the_curves(friction):
     rng = np.random.default_rng(0)
     curves = law_error.curves("own law")
     rubs = friction * np.sign(np.gradient(curves.displacement))
     stress = curves.stress + np.ptp(curves.stress) * (rubs + 0.005 * rng.standard_normal(501))
-    test = replace(
-        micro(None), stress=stress, time=curves.time, displacement=curves.displacement,
-        specimen=Specimen(curves.height, curves.area),
-    )  # fmt: skip
+    specimen = Specimen(curves.height, curves.area)
+    test = loop_measurement(stress, curves.displacement, specimen, curves.time)
     result = ff.fit(test, starts=4)
     if friction:
         found = BestPoint(result.problem, result.problem.vector()).friction
@@ -268,8 +266,7 @@ def test_there_is_no_range_where_the_law_follows_the_curves(friction):
         return
     assert all(item.range is None for item in result.parameters.values())
     assert result.noise["stress_strain"]["law_error"] is None
-    report = readable("s1_kc", result.parameters["s1_kc"])
-    assert report.range == ""
+    assert readable("s1_kc", result.parameters["s1_kc"]).range == ""
 
 
 @needs_data

@@ -49,6 +49,7 @@ MODEL_ERROR = 0.005
 MOST_EXPLAINED = 1.5  # ratio of the RMS residual to the expected noise up to which it is noise
 NORMAL = 1.4826  # standard deviation of normal residuals over their median absolute value
 RANKING = 1e-3  # allowed error of the simulations that rank starts on a thinned record
+JUMP = 10.0  # ratio of the effects of a mode to both sides of a jump of the residual
 THIN = 0.8  # a record is thinned if at most this fraction of its samples is left
 
 
@@ -223,9 +224,9 @@ class Objective:
     def weigh_motion(self, values: Array) -> bool:
         """Weight the residuals by the uncertainty of the driving motion; False if it has none.
 
-        `values` are the optimum of plain least squares; its residual, noise or error of the law,
-        sets the level of each curve. If the motion cannot explain that residual, the law errs and
-        the residuals stay unweighted.
+        `values` are the optimum of plain least squares; its residual sets the level of each curve.
+        If noise and motion cannot explain that residual, the law errs and the residuals stay
+        unweighted, so that the noise does not decide which part of the error the fit follows.
         """
         uncertain = self.by_motion(values)
         if uncertain is None:
@@ -243,9 +244,9 @@ class Objective:
         self.explained = bool(plain @ plain <= MOST_EXPLAINED**2 * expected)
         if not weighing.explains(plain):
             self.unexplained = float(np.abs(weighing.amplitudes(plain)).max())
-            return False
-        self.weighing = weighing
-        return True
+        elif self.explained:
+            self.weighing = weighing
+        return self.weighing is not None
 
     def plain(self, values: Array) -> Array:
         """Return the residuals of the curves without priors and weighing, (n_data,)."""
@@ -258,10 +259,16 @@ class Objective:
         modes = self.scenes.modes(self.scenes.smooth)
         if self.drive == "stress" and (zero := self.measurement.zeros.get("stress", 0.0)):
             modes = np.column_stack((modes, np.full(len(modes), zero)))
-        out = np.empty((self.n_data, modes.shape[1]))
+        out, plain = np.empty((self.n_data, modes.shape[1])), self.plain(values)
         for column, mode in zip(out.T, modes.T, strict=True):
-            sides = [self._moved_by(side * mode).residual(values) for side in (-0.5, 0.5)]
-            column[:] = (sides[1] - sides[0])[: self.n_data]
+            low, high = (
+                2.0 * side * (self._moved_by(0.5 * side * mode).plain(values) - plain)
+                for side in (-1.0, 1.0)
+            )
+            # A loop that only just closes opens on one side, with a jump of the residual.
+            sizes = float(low @ low), float(high @ high)
+            smooth = max(sizes) <= JUMP**2 * min(sizes)
+            column[:] = 0.5 * (low + high) if smooth else (low, high)[int(np.argmin(sizes))]
         return out
 
     def _moved_by(self, change: Array | float) -> Objective:

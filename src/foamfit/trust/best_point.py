@@ -6,6 +6,7 @@ with sensitivities.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -171,10 +172,12 @@ class BestPoint:
     def block(self, errors: Sequence[CurveError]) -> Block:
         """Return the block of this test in a covariance; `errors` are those of its curves."""
         noise, through = [error.noise for error in errors], np.eye(self.sizes.size)
+        errs = any(error.found for error in errors)
         return Block(
             self.scaled, self.problem.objective.sizes, noise, through,
-            gradient=self.gradient if any(error.found for error in errors) else None,
+            gradient=self.gradient if errs else None,
             shifts=self.shifts if self.problem.kept else None,
+            modes=self.modes if errs else None,
             of_priors=self.problem.objective.unit**2,
         )  # fmt: skip
 
@@ -196,6 +199,21 @@ class BestPoint:
         if error and objective.driven and force not in (*out, *self.names):
             out[force] = error * self.problem.slopes(self.values, (force,))[:, 0]
         return np.reshape([*out.values()], (-1, self.residual.size)).T
+
+    @cached_property
+    def modes(self) -> Array:
+        """Change of the residual by one standard deviation of each mode of what drives, (n, q).
+
+        They leave no larger residual than there is.
+        """
+        objective = self.problem.objective
+        if (modes := objective.by_motion(self.values)) is None:
+            return np.empty((self.residual.size, 0))
+        modes = modes if objective.weighing is None else objective.weighing(modes)
+        modes = np.pad(modes, ((0, len(objective.priors)), (0, 0)))
+        basis = basis_of(self.jacobian)
+        left = float(np.linalg.norm(modes - basis @ (basis.T @ modes)))
+        return modes * min(1.0, math.sqrt(self.cost) / max(left, 1e-300))
 
     def gradient(self, step: Array) -> Array:
         """Return half the gradient of the cost after a step of the k parameters.

@@ -95,6 +95,9 @@ class Block:
     # (n, q): change of the residual by one standard error of each quantity that the fit takes as
     # exact, like a parameter held where the record shows it
     shifts: Array | None = None
+    # (n, q): change of the residual by one standard deviation of each mode of an uncertain motion;
+    # such waves are slow, so the noise of a curve with model error does not contain them
+    modes: Array | None = None
     of_priors: float | Array = 1.0  # variance of the remaining residuals
 
     @cached_property
@@ -114,6 +117,9 @@ class Block:
         """Covariance of the noise along the orthonormal columns, (r, r)."""
         rest = self.axes[0][sum(self.sizes) :]
         inner = sum(left.T @ one.times(left) for one, left in self.curves)
+        if self.modes is not None:
+            along = self.axes[0].T @ self.modes
+            inner = inner + along @ along.T
         return np.asarray(inner + rest.T @ (np.reshape(self.of_priors, (-1, 1)) * rest))
 
     def curvature(self, spread: Array) -> Array:

@@ -246,8 +246,11 @@ def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
     if few:
         return Intervals(warnings=(note,))
     drawn = chain.samples
-    if best.problem.kept:  # contact and zeros that are held are off by their errors, first order
-        steps = best.answer(best.shifts)
+    # To first order: contact and zeros that are held are off by their errors, so is the motion.
+    off_by = [best.shifts] if best.problem.kept else []
+    off_by += [best.modes] if best.misfits else []
+    if off_by:
+        steps = best.answer(np.hstack(off_by))
         off = np.random.default_rng([choice.seed, 4]).standard_normal((len(drawn), steps.shape[1]))
         drawn = np.clip(drawn + off @ steps.T, *best.box)
     low, high = np.percentile(drawn, [2.5, 97.5], axis=0).tolist()
