@@ -153,9 +153,9 @@ def _compared(
 ) -> Motion:
     """Compare a motion with runs of shorter steps, until two agree.
 
-    Where steps cannot be shorter, one with longer steps must agree: it errs four times as much, so
-    its difference is three times the error.
-    `lost` is the size of the vibrations that its implicit steps damped out.
+    Where steps cannot be shorter, a run with longer steps must agree: its error is four times as
+    large, so the two differ by three times the error of the motion. `lost` is the size of the
+    vibrations that implicit steps damped out.
     """
     miss, least = math.inf, plans.LEAST_TOL if motion.method == plans.RADAU else None
     for factor in (1e-2, 1e-4, 1e-6):
@@ -170,9 +170,9 @@ def _compared(
                 raise
             break
         if finer.tol > 0.5 * motion.tol:
-            if finer.tol < 2.0 * motion.tol:
-                finer = run(scene.changed(least=4.0 * motion.tol), rtol)
-            miss = _miss(motion.displacement, motion.base_stress, finer)
+            same = finer.tol < 2.0 * motion.tol
+            longer = run(scene.changed(least=4.0 * motion.tol), rtol) if same else finer
+            miss = _miss(motion.displacement, motion.base_stress, longer)
             if miss <= 2.0 * rtol and motion.unresolved <= rtol:
                 return motion
             break

@@ -46,7 +46,10 @@ AIMED = 0.77  # growth of a step whose dense output has an error of 1; few steps
 
 
 def _emit_sum(context, builder, signature, args):
-    """Add up four components at a time, in two sums that do not wait for each other."""
+    """Add up four components at a time, in two sums that do not wait for each other.
+
+    The compiler makes such code of a plain loop only where components are many.
+    """
     n, wide, first, last, scale, weights, sources, stage, begin, out = args
     four, together = ir.VectorType(ir.DoubleType(), 4), ("contract",)
     zero, one, two, quad = (context.get_constant(types.intp, k) for k in (0, 1, 2, 4))
@@ -88,7 +91,7 @@ _sum = contract.emitted(
 def combine(c, n, row, scale, begin, out):
     """Fill out = begin + scale Σ WEIGHT[k] stage[FROM[k]] of a row of coefficients.
 
-    All are filled up to a multiple of four components.
+    Up to three components more than n are filled, for which all arrays have room.
     """
     k, last = FIRST[row], FIRST[row + 1]
     _sum(n, c.wide, k, last, scale, start(WEIGHT), start(FROM), c.stage, begin, out)

@@ -21,8 +21,9 @@ SPRING_FIELDS); internal variables x begin at s[X].
         parameters; an INTERNAL one, for each internal variable, its derivatives by ε, by all
         internal variables before, and by the parameters, and then those of the strain at the end (1
         and zeros at a turning point).
-    settle(row, s, eps)
-        Bring a spring to a strain on its branch: fill s.eps and x.
+    settle(row, s, eps) -> 1 or 0
+        Bring a spring to a strain on its branch: fill s.eps and x. 1: it has filled s.sigma and
+        s.slope as well, so that `evaluate` is needed for derivatives only.
     strain(row, s, sigma) -> ε
         Return the strain at a stress on the branch, and its derivative in s.soft.
 
@@ -329,7 +330,5 @@ evaluating, call_evaluate = pointed(
 )
 switching, call_switch = pointed(REAL, REALS_AT, SPRING, WHOLE, REALS_AT)
 beginning, call_begin = pointed(REAL, REALS_AT, SPRING)
-settling, call_number = pointed(
-    REAL, REALS_AT, SPRING, REAL
-)  #: `strain`, or `settle`, which returns 1 if it fills stress and slope, else 0
+settling, call_number = pointed(REAL, REALS_AT, SPRING, REAL)  #: `settle` or `strain`
 inverting = settling
