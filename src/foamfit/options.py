@@ -23,11 +23,9 @@ Watch = Callable[[Any, Any], None]
 F = TypeVar("F", bound=Callable[..., Any])
 
 DRIVES = ("impact", "stress", "displacement")
-METHODS = ("auto", "local", "profile", "mcmc")  # of the intervals
 # Start points per spring, per spring if several are hysteretic, and the largest number in all.
 STARTS, STARTS_IN_SERIES, MOST_STARTS = 16, 24, 100_000
 MOST_TERMS = 10  # relaxation terms
-DRAWS, LEAST_DRAWS, MOST_DRAWS = 2000, 100, 100_000  # steps of a Markov chain
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,6 @@ class Option:
     metavar: str = ""  # of the value on the command line
     like: str = ""  # an example of a mapping
     python_only: bool = False
-    command_only: bool = False
     frees: tuple[str, ...] = ()  # parameters of some springs that it frees
 
     @property
@@ -140,15 +137,14 @@ class Given:
         "Method of the 95 % intervals: auto is the local covariance, and profiles of the "
         "parameters along which the cost is not parabolic and whose range is not wider.",
         "auto",
-        choices=METHODS,
-        python_only=True,
+        choices=("auto", "local", "profile", "mcmc"),
     )
-    draws: int | None = option(
-        "Number of steps of the Markov chain.",
-        least=LEAST_DRAWS,
-        most=MOST_DRAWS,
-        usual=str(DRAWS),
-        python_only=True,
+    draws: int = option(
+        "Number of steps of the Markov chain (mcmc).",
+        2000,
+        least=100,
+        most=100_000,
+        metavar="N",
     )
     weights: Mapping[str, float] | None = option(
         "Weight of each curve, by its name in `FitResult.misfit`.",
@@ -200,7 +196,7 @@ class Keywords(TypedDict, total=False):
     stiffening: bool
     mullins: bool
     intervals: str
-    draws: int | None
+    draws: int
     weights: Mapping[str, float] | None
     priors: Mapping[str, str | tuple[float, float]] | None
     watch: Watch | None
@@ -246,19 +242,7 @@ _BEFORE = (  # which test and which model
         "bistable",
     ),
 )
-_AFTER = (  # what the command calls two of the intervals
-    Option("profile", "bool", "95 % intervals by profile likelihood.", command_only=True),
-    Option(
-        "mcmc",
-        "int",
-        "95 % intervals by N steps of emcee.",
-        least=LEAST_DRAWS,
-        most=MOST_DRAWS,
-        metavar="N",
-        command_only=True,
-    ),
-)
-OPTIONS = {one.name: one for one in (*_BEFORE, *OF_FIT.values(), *_AFTER)}
+OPTIONS = {one.name: one for one in _BEFORE} | OF_FIT
 FREED = {name: one.frees for name, one in OF_FIT.items() if one.frees}
 
 
@@ -289,12 +273,11 @@ def table() -> str:
     ]
     for one in OPTIONS.values():
         command = "" if one.python_only else f"`{f'{one.flag} {one.metavar}'.strip()}`"
-        python = "" if one.command_only else f"`{one.name}`"
         default = (
             "off"
             if one.kind == "bool"
             else one.usual or str("" if one.default in (None, ()) else one.default)
         )
-        cells = (command, python, one.unit, default, one.right, one.told)
+        cells = (command, f"`{one.name}`", one.unit, default, one.right, one.told)
         lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
     return "\n".join(lines)

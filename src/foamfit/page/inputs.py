@@ -137,7 +137,7 @@ class Field:
 # Options shown at once, and options folded away; tick boxes stand for --fix and --vary.
 CYCLES = ("cycle", "cycles")  # shown if a record has several
 SHOWN = ("model", "drive", "relaxation", *CYCLES)
-FOLDED = (*FREED, "starts", "max_time", "seed", "interior_mass", "time_shift", "profile", "mcmc")
+FOLDED = (*FREED, "starts", "max_time", "seed", "interior_mass", "time_shift", "intervals", "draws")
 # Options that change the curves of a model.
 OF_CURVES = ("drive", "relaxation", "interior_mass", "time_shift", *FREED)
 WRONG = FIELD + ".bk-input { border: 2px solid #b3261e; background: var(--bad); }"
