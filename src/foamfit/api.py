@@ -23,7 +23,6 @@ from foamfit.report.summary import misfit_words, misfits, summary_text
 from foamfit.report.tables import frame
 from foamfit.results import Fit
 from foamfit.solve.precompile import compile_solver
-from foamfit.springs.model import Model
 from foamfit.springs.parameters import unit_of
 from foamfit.trust.intervals import Announce
 
@@ -146,7 +145,7 @@ def fit(
     if model == "auto":
         chosen.check_auto(params=params is not None, priors=measurement.priors)
     else:
-        Model.parse(model, chosen.relaxation)
+        chosen.parse(model)
     compile_once = cache(lambda: compile_solver(model))
 
     def shown(share: float, what: str) -> None:

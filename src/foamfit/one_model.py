@@ -115,7 +115,12 @@ class Options(Given):
         if model == "auto":
             self.check_auto()
         else:
+            self.parse(model)
             self.params(measurement, model)
+
+    def parse(self, model: str) -> Model:
+        """Return the model with these options; InputError if it does not allow them."""
+        return Model.parse(with_options(model, **self.of_springs), self.relaxation)
 
     def check_auto(self, **given: object) -> None:
         """Reject options of a single model, and those in `given`, if models are to be compared."""

@@ -52,17 +52,15 @@ def desk(tmp_path):
 @pytest.fixture
 def ready(desk):
     """Prepare a desk with a test that is ready to be fitted."""
-    desk.take(TEST)
-    desk.check(*desk.dropped_toml())
+    desk.check(*desk.take(TEST))
     return desk
 
 
 class Here(Worker):
     """A worker without a process, because starting one and drawing its report takes seconds."""
 
-    def __init__(self, job):
-        self.job, self.news, self.told, self.stopping = job, News(), "", False
-        self.ended = None
+    def __init__(self, job, tell):
+        self.job, self.news, self.ended, self._tell = job, News(), None, tell
         self._pipe, there = worker_module.processes().Pipe()
         self.process = SimpleNamespace(join=lambda: None, kill=lambda: None)
         threading.Thread(target=self._listen, daemon=True).start()
@@ -136,13 +134,14 @@ def test_a_table_and_a_toml_that_arrive_together_belong_together(desk, order, mo
     now = [100.0]
     monkeypatch.setattr(desk_module.time, "monotonic", lambda: now[0])
     desk.receive("before.csv", b"1,2\n")
+    filled = {}
     for name in order:
         now[0] += 10.0 * (name == order[0])
-        desk.receive(name, b"")
-    assert desk.replaced == (order[0] == "a.csv")  # then the TOML fills what was cleared
-    assert desk.dropped_toml() == ({}, "")
-    desk.receive("after.csv", b"1,2\n")
-    assert desk.replaced
+        filled[name] = desk.receive(name, b'name = "a"')
+    # A table that comes first clears the fields, and then its TOML fills them.
+    assert filled["a.csv"] == (({}, "") if order[0] == "a.csv" else None)
+    assert filled["a.toml"] == ({}, 'name = "a"\n')
+    assert desk.receive("after.csv", b"1,2\n") == ({}, "")
 
 
 def test_a_toml_is_split_and_joined_without_loss():
@@ -189,14 +188,13 @@ def test_a_wrong_quantity_is_named(desk, quantity, value, told):
 @pytest.mark.usefixtures("without_process")
 def test_cycles_and_what_is_held_are_those_of_the_command(desk, tmp_path):
     record = write_record(tmp_path)
-    desk.take(record)
-    desk.check(*desk.dropped_toml(), ["--cycle", "3,2"])
+    desk.check(*desk.take(record), ["--cycle", "3,2"])
     assert (desk.measurement.cycle, desk.measurement.cycles) == (3, (1, 2, 3))
     asked = ["--cycle", "3,2", "--fix=s1_kh_minus=2200000.0", "--vary=s1_eta", "--starts", "2"]
     desk.fit(asked)
     assert desk.ending() == ""
     assert desk.command == f"foamfit fit synthetic.csv --specimen test.toml {' '.join(asked)}"
-    assert "2 of 3 cycles fitted" in desk.worker.told
+    assert "2 of 3 cycles fitted" in ff.load(desk.result).text()
     told = run("fit", str(record), *asked, "--json", f"--out={tmp_path}/r")
     command = json.loads(told.stdout)["cycles"]
     assert sorted(desk.fits) == [2, 3]

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from foamfit.api import FitResult
     from foamfit.data.measurement import Measurement
+    from foamfit.one_model import Options
     from foamfit.study.batch import Batch
     from foamfit.study.cycles import CycleFits
 
@@ -38,15 +39,6 @@ PATIENCE = 10  # s, time limit for a scheduler to answer
 fit_options = options.together(
     *(options.declared(name) for name, one in OPTIONS.items() if not one.python_only)
 )
-
-
-def model_name(asked: Mapping[str, Any]) -> str:
-    """Return the name of the model without spaces; InputError for an unknown model."""
-    from foamfit.springs.model import Model, with_options
-
-    model = asked["model"].strip()
-    with_options(model, **{name: asked[name] for name in FREED})
-    return "auto" if model == "auto" else Model.parse(model, asked["relaxation"]).words
 
 
 def keywords_of(asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -64,46 +56,41 @@ class Ready:
     specimen: Path | None
     measurement: Measurement
     model: str
-    search: dict[str, Any]  # keywords of `foamfit.fit`
+    options: Options
     several: tuple[int, ...] | None  # cycles to be fitted one by one, () for all
 
     @property
-    def options(self) -> dict[str, Any]:
+    def stored(self) -> dict[str, Any]:
         """The options that the result stores."""
-        from foamfit.one_model import Options
-
         several = () if self.several is None else self.several or self.measurement.cycles
-        return Options(**self.search).stored(self.measurement, self.model, several)
+        return self.options.stored(self.measurement, self.model, several)
 
     def fit(self, news: Progress) -> FitResult | CycleFits:
         """Fit the test, or the cycles of the record, and report the progress."""
         from foamfit import api
 
-        search: Any = {"progress": news.progress, "watch": news.watch, "tell": news.tell}
-        search |= self.search | {"model": self.model}
+        how: Any = vars(replace(self.options, watch=news.watch)) | {"model": self.model}
+        how |= {"progress": news.progress, "tell": news.tell}
         if self.several is None:
-            return api.fit(self.measurement, **search)
+            return api.fit(self.measurement, **how)
         from foamfit.study import cycles as study
 
-        return study.fit_cycles(self.test, self.specimen, cycles=self.several or None, **search)
+        return study.fit_cycles(self.test, self.specimen, cycles=self.several or None, **how)
 
 
 def read_as_asked(test: Path, specimen: Path | None, asked: Mapping[str, Any]) -> Ready:
     """Read a test with the options of the command; InputError if it cannot be fitted so."""
     from foamfit.data.csv_file import read_test
+    from foamfit.one_model import Options
 
-    search = keywords_of(asked)
-    model = model_name(asked)
-    wanted = asked["cycle"]
+    model, wanted, options = asked["model"].strip(), asked["cycle"], Options(**keywords_of(asked))
     several, alone = (wanted, None) if isinstance(wanted, tuple) else (None, wanted)
     measurement = read_test(test, specimen, alone, cycles=asked["cycles"])
     for number in set(several or ()).difference(measurement.cycles):
         last = f"its cycles are {min(measurement.cycles)} to {max(measurement.cycles)}"
         raise InputError(f"--cycle {number}: {test} has no cycle {number}; {last}")
-    from foamfit.one_model import Options
-
-    Options(**search).check(measurement, model)  # fail before anything is compiled
-    return Ready(test, specimen, measurement, model, search, several)
+    options.check(measurement, model)  # fail before anything is compiled
+    return Ready(test, specimen, measurement, model, options, several)
 
 
 # Options in the name of a folder: the first ones, in this order, and those of which only the value
@@ -157,12 +144,11 @@ def fit(
         foamfit fit TEST.csv --drive displacement --out results/today --figure-width one
         foamfit fit TEST.csv --model linear+bistable --fix s1_k0=60e6
     """
-    model = asked["model"] = model_name(asked)
     from foamfit.data.toml_file import toml_beside
     from foamfit.report.folder import check_same
 
     ready, toml = read_as_asked(test, specimen, asked), toml_beside(test)
-    made = ready.options
+    made = ready.stored
     if specimen not in (None, toml):
         made["specimen"] = specimen.stem
     folder = output.folder(Path("fits", toml.stem, folder_name(made)))
@@ -172,7 +158,7 @@ def fit(
             check_same(place, ready.measurement.data_sha256, made)
 
     check(folder)
-    options.compile_solver(output.silent, model)
+    options.compile_solver(output.silent, ready.model)
     with progress_line(output.silent, "fit", says=not output.quiet) as news:
         found = replace(ready.fit(news), options=made)
     page = folder / ("report.html" if ready.several is None else "cycles.png")

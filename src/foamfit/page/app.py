@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -22,13 +21,13 @@ from foamfit.errors import InputError
 from foamfit.page import desk as desks, inputs as ui
 from foamfit.page.curves import Curves, misfits_text
 from foamfit.page.turning import Turning
-from foamfit.page.worker import FirstUse, News, Worker, parsed
+from foamfit.page.worker import FirstUse, News, parsed
 from foamfit.parts import law_in_words
 from foamfit.report.folder import load_result
 from foamfit.springs.model import Model
+from foamfit.study.saved import load
 
 EXAMPLE = Path(__file__).with_name("example") / "foam.csv"
-POLL = 200  # interval between two looks at a running fit, ms
 # Shared by all windows: one test is read, and one set of curves prepared, at a time.
 READING, PREPARING = (
     ThreadPoolExecutor(1, thread_name_prefix=f"foamfit-{name}") for name in ("reading", "preparing")
@@ -47,7 +46,6 @@ class Window:
         self, desk: desks.Desk, test: Path | None, first_use: FirstUse, gone: Callable[[], None]
     ) -> None:
         self.desk, self.first_use, self.curves = desk, first_use, Curves()
-        self._shown: object = None
         self._asked = {READING: 0, PREPARING: 0}
         self.received, self.problem, self.progress, self.compiling = (ui.text() for _ in range(4))
         self.understood, self.ending, self.misfit, self.report = (ui.text() for _ in range(4))
@@ -78,9 +76,7 @@ class Window:
         document = pn.state.curdoc
         if not first_use.done.done():  # enable the buttons when the solver is compiled
             first_use.done.add_done_callback(lambda _: document.add_next_tick_callback(self._allow))
-        self._poll = pn.state.add_periodic_callback(self._follow, POLL, start=False)
         pn.state.on_session_destroyed(lambda _: gone())
-        pn.state.onload(send_at_once)
         if test is not None:
             pn.state.onload(partial(self._take, test))
 
@@ -170,41 +166,29 @@ class Window:
         self.upload.value.clear()  # so that the same file can be dropped again
         for name, content in files.items():
             raw = content.encode() if isinstance(content, str) else content  # as Panel decoded it
-            try:
-                told = ui.soft(self.desk.receive(name, raw))
-            except InputError as error:
-                self.received.object = ui.wrong(error)
-                continue
-            if self.desk.dropped is None:  # a TOML fills the fields
-                self.received.object = told
-            self._read()
+            self._read(partial(self.desk.receive, name, raw), table=not name.endswith(".toml"))
 
     def _take(self, path: Path) -> None:
-        try:
-            self.desk.take(path)
-        except (InputError, OSError) as error:
-            self._refuse(error)
-            return
-        self.received.object = ui.soft(path.name)
-        self._read()
+        self._read(partial(self.desk.take, path))
 
-    def _read(self) -> None:
-        """Fill in the values of a dropped TOML, and check the test.
+    def _read(self, receive: Callable[[], desks.Fields | None], *, table: bool = True) -> None:
+        """Receive files, fill in the values of a TOML, and check the test.
 
         Without a TOML the fields are cleared, as they belong to the specimen of the previous file.
         """
         try:
-            found = self.desk.dropped_toml()
-        except InputError as error:
-            self._refuse(error)
+            found = receive()
+        except (InputError, OSError) as error:
+            self.received.object = ui.wrong(error)
             return
+        if table:
+            self.received.object = ui.soft(self.desk.given)
         new = self.desk.worker is None
         if new:  # the displayed fit belongs to another test
             self._hide_result("There is no fit yet.")
             self.curves.held, self.curves.found = {}, {}
-        if found is not None or self.desk.replaced:
-            self.inputs.fill(found or ({}, ""), cycles=new)
-        self.desk.replaced = False
+        if found is not None:
+            self.inputs.fill(found, cycles=new)
         self._check()
 
     def _edited(self) -> None:
@@ -229,9 +213,6 @@ class Window:
         else:
             self._refuse(error)
         self.inputs.mark("" if empty else missing)
-        if str(error) == desks.BUSY:
-            self.curves.sliders.waiting = False
-            return
         self._offer(str(error))
         if error and (csv := self.desk.csv) is not None:
             rest = self.inputs.rest.value or ""
@@ -316,8 +297,9 @@ class Window:
             held, varied = self.curves.chosen()
             arguments += [f"--fix={name}={value!r}" for name, value in held.items()]
             arguments += [f"--vary={name}" for name in varied]
+        document = pn.state.curdoc
         try:
-            self.desk.fit(arguments)
+            self.desk.fit(arguments, lambda: document.add_next_tick_callback(self._follow))
         except InputError as error:
             self.progress.object = ui.wrong(error)
             return
@@ -325,7 +307,6 @@ class Window:
         self._hide_result("A fit is running.")
         self.curves.found = {}
         self._hold(True)
-        self._poll.start()
 
     def _hold(self, running: bool) -> None:
         """Keep the test from being changed during a fit."""
@@ -346,16 +327,11 @@ class Window:
         """Show the progress of the fit, and its result when it has ended."""
         if (worker := self.desk.worker) is None:
             return
-        ended, news = worker.ended, worker.news
-        if ended is not None:
-            self._poll.stop()
-            self._ended(worker)
+        if worker.ended is not None:
+            self._ended()
             return
-        if news is self._shown and not worker.stopping:
-            return
-        self._shown = news
-        share = round(100 * news.fraction)
-        what = "stopping; the best point is kept" if worker.stopping else news.what
+        news, share = worker.news, round(100 * worker.news.fraction)
+        what = "stopping; the best point is kept" if self.stop.disabled else news.what
         told = f"{what}, {share} %"
         if news.misfit:
             told += f"; best misfit {misfits_text(news.misfit)}"
@@ -382,28 +358,25 @@ class Window:
         asked |= {"relaxation": news.relaxation, "drive": news.drive}
         self._turn_model(news.model, news, asked, news.values)
 
-    def _ended(self, worker: Worker) -> None:
+    def _ended(self) -> None:
         """Show the result of the fit, or why it failed."""
         self._allow()
         self.stop.visible = False
         self.progress.object = ui.piece("ended")
         self._hold(False)
-        if self.desk.result is None:
+        if (result := self.desk.result) is None:
             self.ending.object = ui.wrong(self.desk.ending())
             return
-        told, picture = worker.told, self.desk.result / "cycles.png"
-        self.ending.object = ui.soft(f"In a terminal: {self.desk.command}")
-        if told:
-            self.ending.object += ui.piece("verbatim", told)
-        if told and picture.is_file():
+        ending = ui.soft(f"In a terminal: {self.desk.command}")
+        if (picture := result / "cycles.png").is_file():
+            cycles: Any = load(result)
             png = base64.b64encode(picture.read_bytes()).decode()
-            self.ending.object += ui.piece("cycles", png)
+            ending += ui.piece("verbatim", cycles.text()) + ui.piece("cycles", png)
+        self.ending.object = ending
         fits = [*self.desk.fits]
-        self.saves.visible = True
-        self.back.visible, self.report_of.visible = bool(fits), len(fits) > 1
-        if fits:
-            self.report_of.param.update(options=fits, value=fits[0])
-            self._back()
+        self.saves.visible = self.back.visible = True
+        self.report_of.param.update(options=fits, value=fits[0], visible=len(fits) > 1)
+        self._back()
 
     def _back(self, event: Any = None) -> None:
         """Show the report of the fit, and move the sliders back to its values."""
@@ -416,13 +389,3 @@ class Window:
         place = {name: fit[name] for name in ("relaxation", "drive")}
         place |= {name: fit["data"][name] for name in ("cycle", "last_cycle")}
         self._turn_fitted(News(values=values, model=Model.of_result(fit).name, **place))
-
-
-def send_at_once() -> None:
-    """Send messages of this window without waiting for acknowledgements (40 ms each).
-
-    Bokeh gives no public access to its sockets; if this fails, curves are drawn late.
-    """
-    with suppress(AttributeError):
-        for connection in pn.state.curdoc.session_context.session._subscribed_connections:
-            connection._socket.set_nodelay(True)

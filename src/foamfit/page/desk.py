@@ -13,7 +13,7 @@ import tempfile
 import time
 import tomllib
 import unicodedata
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,6 +53,9 @@ QUANTITIES = {
     "[specimen] mass": ("Specimen mass (optional)", "5.56 mg"),
 }
 
+# Quantities filled in, by name, and further TOML.
+Fields = tuple[dict[str, str], str]
+
 
 class Desk:
     """The files, the test and the fit of one window, in its own folder."""
@@ -62,8 +65,6 @@ class Desk:
         folder.mkdir(mode=0o700, exist_ok=True)
         self.csv: Path | None = None
         self.given = ""  # name of the file as the user gave it
-        self.dropped: bytes | None = None  # a TOML that has not been read yet
-        self.replaced = False  # whether the file has replaced another and has not been read yet
         # Times at which a table arrived, and a TOML that came before its table.
         self._came, self._ahead = -math.inf, -math.inf
         self.measurement: Measurement | None = None
@@ -78,10 +79,11 @@ class Desk:
 
     # ------------------------------------------------------------------------------- files
 
-    def receive(self, name: str, content: bytes) -> str:
-        """Store a dropped file under a safe name, and return its own name.
+    def receive(self, name: str, content: bytes) -> Fields | None:
+        """Store a dropped table under a safe name, or return the content of a TOML.
 
-        Raises InputError if the file is too large or not a table.
+        A table that replaces another returns empty fields, unless its TOML has just come. Raises
+        InputError if the file is too large or not a table, or an invalid TOML.
         """
         if self.running:
             raise InputError(BUSY)
@@ -91,12 +93,13 @@ class Desk:
                 f"{given} is larger than {LARGEST // 2**20} MB, the limit of the page; "
                 "use foamfit fit in a terminal."
             )
-        suffix = Path(name).suffix.lower()
-        now = time.monotonic()
+        suffix, now = Path(name).suffix.lower(), time.monotonic()
         if suffix == ".toml":
-            self.dropped = content
             self._ahead = now if now - self._came > TOGETHER else -math.inf
-            return given
+            try:
+                return split_toml(content.decode("utf-8-sig"))
+            except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+                raise InputError(f"The dropped file is not valid TOML: {error}.") from None
         if suffix not in ENDINGS:
             raise InputError(
                 f"{given} is not a table; drop a file that ends in {listed(ENDINGS)}, or a TOML."
@@ -104,34 +107,21 @@ class Desk:
         place = self.folder / "test"
         shutil.rmtree(place, ignore_errors=True)
         place.mkdir()
-        self.replaced = self.csv is not None and now - self._ahead > TOGETHER
+        replaced = self.csv is not None and now - self._ahead > TOGETHER
         self._came, self._ahead = now, -math.inf
         self.csv, self.given, self.measurement, self.worker = place / name, given, None, None
         self.csv.write_bytes(content)
-        return given
+        return ({}, "") if replaced else None
 
-    def take(self, csv: Path) -> None:
+    def take(self, csv: Path) -> Fields | None:
         """Copy a test from this machine, with its TOML, into the folder of the window.
 
         Only the command and the example may name such a file, never the browser.
         """
         known = csv.suffix.lower() in ENDINGS
-        self.receive(csv.name if known else f"{csv.stem}.csv", csv.read_bytes())
-        if (toml := toml_beside(csv)).is_file():
-            self.dropped = toml.read_bytes()
-
-    def dropped_toml(self) -> tuple[dict[str, str], str] | None:
-        """Return the quantities and the rest of the TOML dropped last; None without a TOML.
-
-        It is read once. Raises InputError if it is invalid.
-        """
-        if self.dropped is None:
-            return None
-        raw, self.dropped = self.dropped, None
-        try:
-            return split_toml(raw.decode("utf-8-sig"))
-        except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-            raise InputError(f"The dropped file is not valid TOML: {error}.") from None
+        cleared = self.receive(csv.name if known else f"{csv.stem}.csv", csv.read_bytes())
+        toml = toml_beside(csv)
+        return self.receive("test.toml", toml.read_bytes()) if toml.is_file() else cleared
 
     # ------------------------------------------------------------------------------- the test
 
@@ -182,8 +172,11 @@ class Desk:
 
     # ------------------------------------------------------------------------------- the fit
 
-    def fit(self, arguments: list[str]) -> Worker:
-        """Start a fit of the test checked last, with arguments of `foamfit fit`."""
+    def fit(self, arguments: list[str], tell: Callable[[], object] = lambda: None) -> Worker:
+        """Start a fit of the test checked last, with arguments of `foamfit fit`.
+
+        `tell` is called in a thread whenever the fit has news, and at its end.
+        """
         if self.csv is None or self.measurement is None:
             raise InputError("The test cannot be read yet; see the error message.")
         if self.running:
@@ -193,7 +186,7 @@ class Desk:
         folder = self.folder / f"fit-{self._fits}"
         toml = folder.with_suffix(".toml")  # the page may change it later
         toml.write_bytes(self.toml)
-        self.worker = Worker(Job(self.csv, toml, folder, arguments))
+        self.worker = Worker(Job(self.csv, toml, folder, arguments), tell)
         return self.worker
 
     @property
@@ -271,7 +264,7 @@ def safe_name(name: str) -> str:
     return f"{stem[: LONGEST - 10]}{dot}{suffix[:8]}"
 
 
-def split_toml(text: str) -> tuple[dict[str, str], str]:
+def split_toml(text: str) -> Fields:
     """Split a TOML into the quantities of the page, by name, and the rest as TOML."""
     document = tomllib.loads(text)
     found = {}

@@ -17,7 +17,7 @@ from panel.custom import JSComponent
 
 from foamfit.errors import InputError, SimulationError
 from foamfit.options import FREED, OPTIONS
-from foamfit.page.desk import FIRST, QUANTITIES, UNITS, with_column
+from foamfit.page.desk import FIRST, QUANTITIES, UNITS, Fields, with_column
 from foamfit.report.render import environment
 from foamfit.springs import laws
 
@@ -212,7 +212,7 @@ class Inputs:
         shown = (field for name, field in self.options.items() if not hidden.get(name))
         return [argument for field in shown for argument in field.arguments()]
 
-    def fill(self, found: tuple[Mapping[str, str], str], *, cycles: bool) -> None:
+    def fill(self, found: Fields, *, cycles: bool) -> None:
         """Fill in the content of a TOML; with `cycles` the choice of cycles is cleared."""
         self._filling = True  # one check is enough
         quantities, self.rest.value = found

@@ -33,15 +33,6 @@ from foamfit.terminal import ENDING, say
 
 HOST = "127.0.0.1"
 UNUSED = 20_000  # ms after which the files of a closed window are removed
-REFUSED = "Access denied; open the address that foamfit page has printed."
-
-
-class Refusal(web.RequestHandler):
-    """Rejects every request."""
-
-    def prepare(self) -> None:
-        """Answer with a page that has the reason."""
-        raise web.HTTPError(403, reason=REFUSED)
 
 
 class Guard(routing.Router):
@@ -50,17 +41,19 @@ class Guard(routing.Router):
     def __init__(self, behind: web.Application, port: int, token: str) -> None:
         self.behind, self.token = behind, token
         self.host = f"{HOST}:{port}"
-        self.refusing = web.Application([(".*", Refusal)])
+        self.refusing = web.Application([(".*", web.ErrorHandler, {"status_code": 403})])
 
     def find_handler(
         self, request: httputil.HTTPServerRequest, **kwargs: Any
     ) -> httputil.HTTPMessageDelegate | None:
         """Return the handler of a request."""
         origins = request.headers.get_list("Origin")
-        own = request.headers.get_list("Host") == [self.host]
-        own = own and all(origin == f"http://{self.host}" for origin in origins)
-        given = request.path.split("/")[1] if "/" in request.path else ""
-        own = own and secrets.compare_digest(given.encode(), self.token.encode())
+        given = request.path.removeprefix("/").partition("/")[0]
+        own = (
+            request.headers.get_list("Host") == [self.host]
+            and all(origin == f"http://{self.host}" for origin in origins)
+            and secrets.compare_digest(given.encode(), self.token.encode())
+        )
         return (self.behind if own else self.refusing).find_handler(request, **kwargs)
 
 
@@ -86,8 +79,11 @@ class Page:
             unused_session_lifetime_milliseconds=UNUSED,
             check_unused_sessions_milliseconds=UNUSED // 4,
         )
-        # Put in front of Bokeh's own application, which has no public interface for this.
+        # Put in front of Bokeh's own application, and send messages without waiting for
+        # acknowledgements (40 ms each); neither has a public interface.
         self.server._http.request_callback = Guard(self.server._tornado, self.port, self.token)
+        for one in self.server._http._sockets.values():  # sockets of the windows inherit it
+            one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.server.start()
 
     @property
@@ -125,7 +121,6 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
             ending = asyncio.Event()
             loop = asyncio.get_running_loop()
             loop.set_exception_handler(_pass_over_closed_windows)
-            logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)
             for number in ENDING:  # on Windows a loop has no handlers of signals
                 signal.signal(number, lambda *_: loop.call_soon_threadsafe(ending.set))
             say(page.address)
@@ -133,11 +128,10 @@ def serve(test: Path | None, port: int, browser: bool) -> None:
             if browser:
                 await asyncio.to_thread(webbrowser.open, page.address)
             await ending.wait()
-            # Messages of windows that are still open are cancelled.
-            logging.getLogger("tornado.application").setLevel(logging.CRITICAL)
         finally:
             page.close()
 
+    logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)
     with suppress(KeyboardInterrupt):
         asyncio.run(run())
 
@@ -150,12 +144,9 @@ def _pass_over_closed_windows(loop: asyncio.AbstractEventLoop, context: dict[str
 
 def _free_port(wanted: int) -> int:
     """Return the requested port, or a free one for 0; InputError if the port is in use."""
-    with socket.socket() as free:
-        free.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            free.bind((HOST, wanted))
-        except OSError as error:
-            raise InputError(
-                f"--port {wanted} cannot be used: {error.strerror}; choose another one"
-            ) from None
-        return int(free.getsockname()[1])
+    try:
+        with socket.create_server((HOST, wanted)) as free:
+            return int(free.getsockname()[1])
+    except OSError as error:
+        why = f"--port {wanted} cannot be used: {error.strerror}; choose another one"
+        raise InputError(why) from None

@@ -11,6 +11,7 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -70,12 +71,10 @@ def processes() -> Any:
 
 
 class Worker:
-    """A fit in another process: its last report, and how it ended."""
+    """A fit in another process; `tell` is called in a thread at each report and at the end."""
 
-    def __init__(self, job: Job) -> None:
-        self.job, self.news = job, News()
-        self.stopping = False
-        self.told = ""  # text that the command prints for several cycles
+    def __init__(self, job: Job, tell: Callable[[], object] = lambda: None) -> None:
+        self.job, self.news, self._tell = job, News(), tell
         self.ended: str | None = None  # after the end: why there is no result, or ""
         self._pipe, there = processes().Pipe()
         self.process = processes().Process(target=run, args=(job, there), daemon=True)
@@ -85,10 +84,8 @@ class Worker:
 
     def stop(self) -> None:
         """Stop the search; the result of the best point is still written."""
-        if not self.stopping:
-            self.stopping = True
-            with suppress(OSError):  # the process has ended
-                self._pipe.send(STOP)
+        with suppress(OSError):  # the process has ended
+            self._pipe.send(STOP)
 
     def end(self) -> None:
         """End the process at once."""
@@ -101,14 +98,16 @@ class Worker:
             while done is None:
                 if isinstance(report := self._pipe.recv(), News):
                     self.news = report
+                    self._tell()
                 else:
-                    done, self.told = report
+                    done = report
         self.process.join()
         if done is None:
             code = self.process.exitcode or 0
             how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
             done = f"The process of the fit has died {how}; start the fit again."
         self.ended = done
+        self._tell()
 
 
 class FirstUse:
@@ -155,13 +154,11 @@ class _Teller(Watcher):
         self.pipe, self.news = pipe, News()
         self._said = 0.0
 
-    def progress(self, fraction: float, what: str, *, now: bool = False) -> None:
-        """Report the completed fraction, at most once per `APART` seconds unless `now`."""
-        self.news = replace(self.news, fraction=fraction, what=what)
-        if now and self._best is not None:
-            self._next = 0.0
+    def progress(self, fraction: float, what: str) -> None:
+        """Report the completed fraction at each new step, and every `APART` seconds."""
+        new, self.news = what != self.news.what, replace(self.news, fraction=fraction, what=what)
         self.look()
-        if now or time.monotonic() - self._said >= APART:
+        if new or time.monotonic() - self._said >= APART:
             self._say()
 
     def seen(self, problem: Problem, values: Array, misfit: dict[str, float | None]) -> None:
@@ -195,32 +192,29 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
         context = own.make_context("fit", ["TEST.csv", *arguments])
     except click.ClickException as error:
         raise InputError(error.format_message()) from None
-    kept = OPTIONS.keys() - {"specimen"} | {"figure_width"}
+    kept = OPTIONS.keys() - {"specimen"}
     return {name: value for name, value in context.params.items() if name in kept}
 
 
-def _fitted(job: Job, teller: _Teller) -> tuple[str, str]:
-    """Fit and write the result; return why the fit failed or "", and the text on cycles."""
+def _fitted(job: Job, teller: _Teller) -> str:
+    """Fit and write the result; return why the fit failed, or ""."""
     from foamfit.cli.fit import read_as_asked
 
     try:
         threading.Thread(target=_wait_for_stop, args=(teller.pipe,), daemon=True).start()
         laws.load_texts(job.laws)
-        asked = parsed(job.arguments)
-        width = asked.pop("figure_width")
-        tell = partial(teller.progress, 0.0, COMPILING, now=True)
-        ready = read_as_asked(job.csv, job.toml, asked)
-        compile_solver(asked["model"], tell)
+        ready = read_as_asked(job.csv, job.toml, parsed(job.arguments))
+        compile_solver(ready.model, partial(teller.progress, 0.0, COMPILING))
         with as_signalled():
             found = ready.fit(teller)
         with without_ctrl_c():
-            teller.progress(1.0, "writing the report", now=True)
-            found.save(job.folder, figure_width=width)
-            return "", "" if ready.several is None else found.text()
+            teller.progress(1.0, "writing the report")
+            found.save(job.folder)
     except (InputError, SimulationError) as error:
-        return str(error), ""
+        return str(error)
     except KeyboardInterrupt:
-        return STOPPED_EARLY, ""
+        return STOPPED_EARLY
+    return ""
 
 
 def _wait_for_stop(pipe: Connection) -> None:

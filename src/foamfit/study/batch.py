@@ -40,7 +40,6 @@ from foamfit.report.listing import REFUSED, Row, row_of
 from foamfit.results import stamp
 from foamfit.solve import precompile
 from foamfit.springs import laws
-from foamfit.springs.model import Model, with_options
 from foamfit.study.cycles import fit_cycles
 from foamfit.study.processes import FITS, PAGES, EndedError, Processes, cores
 from foamfit.study.study_file import find_tests
@@ -264,7 +263,7 @@ def _checked(model: str, options: Options) -> str:
     if model.strip() == "auto":
         options.check_auto()
         return "auto"
-    read = Model.parse(with_options(model, **options.of_springs), options.relaxation)
+    read = options.parse(model)
     drive = options.drive or "impact"  # has all nuisance parameters; each test checks its own
     names = (*read.names, *nuisance.names_of(drive, time_shift=True))
     check_fixed_and_varied(names, read.name, options.fix or {}, options.vary)
