@@ -93,18 +93,15 @@ def _harmless(cell: object) -> object:
 
 
 @contextmanager
-def replacing(target: Path, *, folder: bool = True, swept: bool = False) -> Iterator[Path]:
+def replacing(target: Path, *, folder: bool = True) -> Iterator[Path]:
     """Give the body a temporary path that replaces `target` (a resolved path) at the end.
 
-    The path is an empty `folder`, or else a file that the body creates. A caller that writes many
-    folders into one calls `sweep` once and passes `swept`: the time to sweep for each folder would
-    grow with the square of their number.
+    The path is an empty `folder`, or else a file that the body creates.
     """
     made = [parent for parent in target.parents if not parent.exists()]
     fresh, old = _beside(target, "new"), _beside(target, "old")
     try:
-        if not swept:
-            sweep(target.parent, [target.name])
+        sweep(target.parent, [target.name])
         if folder:
             fresh.mkdir(parents=True)
         yield fresh

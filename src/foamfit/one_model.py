@@ -40,9 +40,6 @@ Progress = Callable[[float, str], None]
 # Budget of the profiles, and of the ranges, as a multiple of the evaluations of the search, and the
 # largest number of restarts from a better point found by either.
 PROFILE_SHARE, IMPROVEMENTS = 0.5, 3
-# Such a restart must begin within this multiple of the evaluations of the search, unless the user
-# has chosen a method for the intervals.
-TOGETHER = 0.8
 # Ranges are computed again if a better point has less than this fraction of the cost.
 MOVED = 0.999
 # Evaluations that ranges and profiles usually need, as a multiple of those of the search: with an
@@ -281,12 +278,8 @@ def _assess(
     """Compute ranges and intervals; if they find a better point, start again from it."""
     problem, tracker, record = found.problem, found.tracker, found.record
     budget = PROFILE_SHARE * problem.objective.evaluations
-    enough = (1.0 + TOGETHER) * problem.objective.evaluations
-    enough = enough if choice.method in ("auto", "local") else math.inf
     left, cost_of_ranges = Open(), math.inf
-    for _ in range(IMPROVEMENTS + 1):
-        if not best.names or problem.objective.evaluations > enough:
-            break
+    for restarts in range(IMPROVEMENTS + 1):
         before = tracker.best_cost
         try:
             better = None
@@ -296,11 +289,11 @@ def _assess(
                 left = left_open(best, tracker.ends, tracker, budget, other)
                 better, cost_of_ranges = left.better if other else None, best.cost
             made = Intervals(better=better)
-            if better is None:
+            if better is None or restarts == IMPROVEMENTS:
                 minima = [*tracker.ends, *left.minima]
                 made = assess(best, choice, tracker, minima, budget, announce, left.ranges)
-            if made.better is None:
-                return best, record, replace(made, ranges=left.ranges)
+            if made.better is None or restarts == IMPROVEMENTS:
+                break
             tracker.consider(made.better)
             settle.refine(problem, tracker)
             settle.back_to_plain(problem, tracker)
@@ -309,8 +302,6 @@ def _assess(
         best = found.best()
         if tracker.best_cost < before / 1.02:  # a minimum that the search missed
             record = replace(record, costs=((tracker.best_cost, 1), *record.costs))
-    minima = [*tracker.ends, *left.minima]
-    made = assess(best, choice, tracker, minima, 0.0, announce, left.ranges)
     return best, record, replace(made, better=None, ranges=left.ranges)
 
 

@@ -206,13 +206,11 @@ class Window:
     def _show_checked(self, found: str | Exception) -> None:
         error = found if isinstance(found, Exception) else ""
         missing = desks.wrong_quantity(str(error))
-        empty = bool(missing) and not self.inputs.quantities[missing].value
-        if empty:
+        if missing and not self.inputs.quantities[missing].value:
             label, example = desks.QUANTITIES[missing]
             self.problem.object = ui.soft(PROMPT.format(label.lower(), example))
         else:
             self._refuse(error)
-        self.inputs.mark("" if empty else missing)
         self._offer(str(error))
         if error and (csv := self.desk.csv) is not None:
             rest = self.inputs.rest.value or ""
@@ -273,11 +271,8 @@ class Window:
             return made
 
         self.curves.sliders.waiting = True
-        what = f"Preparing the curves of {law_in_words(model, options['relaxation'])} …"
-        if self.curves.turning is None and not self.compiling.object:
-            self.misfit.object = ui.piece("busy", what)
-        else:
-            self.curves.sliders.tell(what)
+        what = law_in_words(model, options["relaxation"])
+        self.misfit.object = ui.piece("busy", f"Preparing the curves of {what} …")
         self._beside(PREPARING, make, self._show_turning)
 
     def _show_turning(self, made: Turning | Exception | str) -> None:

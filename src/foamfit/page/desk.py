@@ -12,7 +12,6 @@ import shutil
 import tempfile
 import time
 import tomllib
-import unicodedata
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from foamfit.data.energy import audit
 from foamfit.data.measurement import Measurement
 from foamfit.data.tables.columns import Source
 from foamfit.data.tables.csv_table import read_text
-from foamfit.data.toml_file import toml_beside
+from foamfit.data.toml_file import LONGEST, toml_beside
 from foamfit.errors import InputError
 from foamfit.page.worker import Job, Worker, parsed
 from foamfit.report import figures
@@ -33,11 +32,9 @@ from foamfit.report.described import describe
 from foamfit.report.panels import Line, Panel
 from foamfit.report.plots import panelled
 from foamfit.study.study_file import ENDINGS
-from foamfit.terminal import printable
 from foamfit.text import listed
 
 LARGEST = 64 * 1024 * 1024  # bytes of the largest file that can be dropped
-LONGEST = 80  # characters of the longest file name
 TOGETHER = 5.0  # s within which a table and its TOML arrive if they are dropped together
 SAVED_TOML = "test.toml"  # name of the TOML that the page saves
 BUSY = "A fit is running; stop it before you change the test."
@@ -80,20 +77,21 @@ class Desk:
     # ------------------------------------------------------------------------------- files
 
     def receive(self, name: str, content: bytes) -> Fields | None:
-        """Store a dropped table under a safe name, or return the content of a TOML.
+        """Store a dropped table as test.*, or return the content of a TOML.
 
         A table that replaces another returns empty fields, unless its TOML has just come. Raises
         InputError if the file is too large or not a table, or an invalid TOML.
         """
         if self.running:
             raise InputError(BUSY)
-        given, name = printable(name.replace("\\", "/").rsplit("/", 1)[-1]), safe_name(name)
+        name = name.replace("\\", "/").rsplit("/", 1)[-1]
+        given = "".join(one if one.isprintable() else "_" for one in name)
         if len(content) > LARGEST:
             raise InputError(
                 f"{given} is larger than {LARGEST // 2**20} MB, the limit of the page; "
                 "use foamfit fit in a terminal."
             )
-        suffix, now = Path(name).suffix.lower(), time.monotonic()
+        suffix, now = Path(given).suffix.lower(), time.monotonic()
         if suffix == ".toml":
             self._ahead = now if now - self._came > TOGETHER else -math.inf
             try:
@@ -104,12 +102,10 @@ class Desk:
             raise InputError(
                 f"{given} is not a table; drop a file that ends in {listed(ENDINGS)}, or a TOML."
             )
-        place = self.folder / "test"
-        shutil.rmtree(place, ignore_errors=True)
-        place.mkdir()
         replaced = self.csv is not None and now - self._ahead > TOGETHER
         self._came, self._ahead = now, -math.inf
-        self.csv, self.given, self.measurement, self.worker = place / name, given, None, None
+        self.csv, self.given = self.folder / f"test{suffix}", given
+        self.measurement, self.worker = None, None
         self.csv.write_bytes(content)
         return ({}, "") if replaced else None
 
@@ -138,7 +134,9 @@ class Desk:
             raise InputError("There is no test yet; drop a CSV or try the example.")
         toml = self.csv.with_suffix(".toml")
         try:
-            toml.write_text(join_toml(quantities, rest), encoding="utf-8")
+            name = Path(self.given).stem.strip()[:LONGEST] or "test"
+            document = {"name": name} | join_toml(quantities, rest)
+            toml.write_text(tomli_w.dumps(document), encoding="utf-8")
             asked = parsed([*arguments])
             wanted = asked["cycle"]
             first = next(iter(wanted), None) if isinstance(wanted, tuple) else wanted
@@ -166,8 +164,7 @@ class Desk:
 
     def _plain(self, text: str) -> str:
         """Return a message with the user's name of the file, without the folder of the window."""
-        for folder in (self.folder / "test", self.folder):
-            text = text.replace(f"{folder}/", "").replace(f"{folder}\\", "")
+        text = text.replace(f"{self.folder}/", "").replace(f"{self.folder}\\", "")
         return text if self.csv is None else text.replace(self.csv.name, self.given)
 
     # ------------------------------------------------------------------------------- the fit
@@ -254,16 +251,6 @@ def wrong_quantity(message: str) -> str:
     return next((name for name in QUANTITIES if f"{name} " in message), "")
 
 
-def safe_name(name: str) -> str:
-    """Return a file name without its folder, with only characters that are safe in a shell."""
-    name = unicodedata.normalize("NFKC", name).replace("\\", "/").rsplit("/", 1)[-1]
-    name = re.sub(r"[^\w.()+-]+", "_", name).lstrip("._-")
-    stem, dot, suffix = name.rpartition(".")
-    if not stem:
-        stem, dot, suffix = name or "test", "", ""
-    return f"{stem[: LONGEST - 10]}{dot}{suffix[:8]}"
-
-
 def split_toml(text: str) -> Fields:
     """Split a TOML into the quantities of the page, by name, and the rest as TOML."""
     document = tomllib.loads(text)
@@ -286,7 +273,7 @@ def _document(rest: str) -> dict[str, Any]:
         raise InputError(f"The further TOML is not valid TOML: {error}.") from None
 
 
-def join_toml(quantities: Mapping[str, str], rest: str) -> str:
+def join_toml(quantities: Mapping[str, str], rest: str) -> dict[str, Any]:
     """Merge the quantities filled in with the rest of the TOML; InputError if it is invalid."""
     document = _document(rest)
     for name in QUANTITIES:
@@ -298,7 +285,7 @@ def join_toml(quantities: Mapping[str, str], rest: str) -> str:
             if key in section:
                 raise InputError(f"The further TOML: {name} is also filled in above; give it once.")
             section[key] = value
-    return tomli_w.dumps(document)
+    return document
 
 
 # Choices of unit for each channel that the page offers.

@@ -140,7 +140,6 @@ SHOWN = ("model", "drive", "relaxation", *CYCLES)
 FOLDED = (*FREED, "starts", "max_time", "seed", "interior_mass", "time_shift", "intervals", "draws")
 # Options that change the curves of a model.
 OF_CURVES = ("drive", "relaxation", "interior_mass", "time_shift", *FREED)
-WRONG = FIELD + ".bk-input { border: 2px solid #b3261e; background: var(--bad); }"
 
 
 class Inputs:
@@ -221,11 +220,6 @@ class Inputs:
         for field in self.cycles if cycles else ():
             field.value = ""
         self._filling = False
-
-    def mark(self, wrong: str) -> None:
-        """Mark the field of one quantity as wrong, and no other."""
-        for name, field in self.quantities.items():
-            field.stylesheets = [WRONG if name == wrong else FIELD]
 
     def show_cycles(self, count: int) -> None:
         """Show the fields that choose cycles if a record has several."""

@@ -100,16 +100,16 @@ def brief(title: str, line: str, rows: Sequence[Readable]) -> str:
     return "\n".join([*wrapped(f"{title}: {line}", 2), *wrapped(", ".join(values), 2)])
 
 
-def save_whole(folder: str | Path, write: Callable[[Path], None], *, swept: bool = False) -> Path:
+def save_whole(folder: str | Path, write: Callable[[Path], None]) -> Path:
     """Let `write` fill a new folder, which replaces an older result when complete; return it.
 
     Parent folders are created. If `folder` must not be replaced (see `check_target`) or cannot be
-    written, InputError is raised and nothing is changed. For `swept` see `foamfit.files.replacing`.
+    written, InputError is raised and nothing is changed.
     """
     folder = Path(folder)
     check_target(folder)
     try:
-        with replacing(folder.resolve(), swept=swept) as fresh:
+        with replacing(folder.resolve()) as fresh:
             write(fresh)
             check_target(folder)  # keep files that were added in the meantime
     except OSError as error:

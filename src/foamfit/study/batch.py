@@ -386,7 +386,7 @@ def _written(task: Task) -> tuple[Row, ...]:
         write(folder)
         write_json(folder / RECORD, record)
 
-    save_whole(task.out, fill, swept=True)
+    save_whole(task.out, fill)
     return rows
 
 
