@@ -81,7 +81,7 @@ def test_holds_rests_and_steps_hide_no_loading(
 
 def test_steps_of_a_driving_stress_all_count(tmp_path: Path) -> None:
     """It was zero up to the end of the first step: k0 was a quarter too small, determined."""
-    time = np.linspace(0.0, 30.0, 1001)
+    time = np.linspace(0.0, 30.0, 501)
     corners = [t for k in range(5) for t in (5.0 * k, 5.0 * k + 0.5)]
     stress = np.interp(
         time, [*corners, 25.0, 28.0], [*np.repeat(np.arange(6) * 9e4, 2)[1:-1], 4.5e5, 0.0]
