@@ -27,6 +27,7 @@ import fabricated
 import foamfit as ff
 from foamfit.cli import main
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.fitting import search
 from foamfit.report import folder as result_folder
 from foamfit.solve import cache, precompile
 
@@ -121,6 +122,12 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Change to an empty directory."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture
+def without_hops(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Omit hops from the best minimum, which take half of a search and have tests of their own."""
+    monkeypatch.setattr(search, "leave_minimum", lambda *_: [])
 
 
 def run(*args: object, code: int | tuple[int, ...] = 0, encoding: str = "utf-8") -> Result:

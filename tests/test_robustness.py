@@ -19,6 +19,7 @@ from foamfit.report.plots import plot_fit
 from foamfit.report.summary import summary_text
 from foamfit.springs.model import Model
 
+pytestmark = pytest.mark.usefixtures("without_hops")
 BISTABLE = Model.parse("bistable")
 
 
