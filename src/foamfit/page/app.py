@@ -114,7 +114,6 @@ class Window:
         saves = [
             save("the result folder", "result.zip", self.desk.zipped),
             save("the report", "report.html", lambda: self._report().encode()),
-            save("the TOML", desks.SAVED_TOML, lambda: self.desk.toml),
             save("the LS-DYNA card", "card.zip", lambda: self.desk.card(self.report_of.value)),
             save("the test plan", "plan.html", lambda: self.desk.planned(self.report_of.value)),
         ]
@@ -298,15 +297,16 @@ class Window:
         except InputError as error:
             self.progress.object = ui.wrong(error)
             return
-        self.run.disabled, self.stop.visible, self.stop.disabled = True, True, False
         self._hide_result("A fit is running.")
         self.curves.found = {}
         self._hold(True)
 
     def _hold(self, running: bool) -> None:
-        """Keep the test from being changed during a fit."""
+        """Keep the test from being changed during a fit, which can be stopped."""
         self.inputs.hold(running)
         self.example.disabled = self.check.disabled = running
+        self.stop.param.update(visible=running, disabled=False)
+        self._allow()
 
     def _hide_result(self, why: str) -> None:
         self.saves.visible = self.back.visible = self.report_of.visible = False
@@ -355,14 +355,12 @@ class Window:
 
     def _ended(self) -> None:
         """Show the result of the fit, or why it failed."""
-        self._allow()
-        self.stop.visible = False
-        self.progress.object = ui.piece("ended")
         self._hold(False)
+        self.progress.object = ui.piece("ended")
         if (result := self.desk.result) is None:
             self.ending.object = ui.wrong(self.desk.ending())
             return
-        ending = ui.soft(f"In a terminal: {self.desk.command}")
+        ending = ui.soft(f"In a terminal, in the saved folder: {self.desk.command}")
         if (picture := result / "cycles.png").is_file():
             cycles: Any = load(result)
             png = base64.b64encode(picture.read_bytes()).decode()

@@ -156,17 +156,10 @@ class Curves:
 
     def _moved(self, event: Any) -> None:
         """Draw the curves for the sliders that were moved, and store the ticks."""
-        sent = event.data if isinstance(event.data, dict) else {}  # a browser may send anything
-        moves, held = (
-            one if isinstance(one, dict) else {} for one in (sent.get("moves"), sent.get("held"))
-        )
-        self.held |= {name: bool(value) for name, value in held.items() if name in self._rows}
-        wanted = {
-            name: float(value) * self._rows[name].factor
-            for name, value in moves.items()
-            if name in self._rows and isinstance(value, int | float)
-        }
-        if self.turning is not None and wanted:
+        moves, held = event.data.get("moves", {}), event.data.get("held", {})
+        rows = self._rows
+        self.held |= {name: value for name, value in held.items() if name in rows}
+        if wanted := {n: value * rows[n].factor for n, value in moves.items() if n in rows}:
             self._draw(wanted)
         if moves:
             self.sliders.drawn()

@@ -36,7 +36,7 @@ from foamfit.text import listed
 
 LARGEST = 64 * 1024 * 1024  # bytes of the largest file that can be dropped
 TOGETHER = 5.0  # s within which a table and its TOML arrive if they are dropped together
-SAVED_TOML = "test.toml"  # name of the TOML that the page saves
+SAVED_TOML = "test.toml"  # name of the TOML in a saved result folder
 BUSY = "A fit is running; stop it before you change the test."
 # Label and example of each quantity to fill in, by its name in messages. The first `FIRST` are
 # always shown, the others folded away.
@@ -157,11 +157,6 @@ class Desk:
         which: Any = {"cycles": (cycle, last)} if last else {"cycle": cycle}
         return read_test(self.csv, self.csv.with_suffix(".toml"), **which)
 
-    @property
-    def toml(self) -> bytes:
-        """The TOML with the values filled in."""
-        return b"" if self.csv is None else self.csv.with_suffix(".toml").read_bytes()
-
     def _plain(self, text: str) -> str:
         """Return a message with the user's name of the file, without the folder of the window."""
         text = text.replace(f"{self.folder}/", "").replace(f"{self.folder}\\", "")
@@ -182,7 +177,7 @@ class Desk:
         self._fits += 1
         folder = self.folder / f"fit-{self._fits}"
         toml = folder.with_suffix(".toml")  # the page may change it later
-        toml.write_bytes(self.toml)
+        shutil.copy(self.csv.with_suffix(".toml"), toml)
         self.worker = Worker(Job(self.csv, toml, folder, arguments), tell)
         return self.worker
 
@@ -210,7 +205,7 @@ class Desk:
 
     @property
     def command(self) -> str:
-        """The command that repeats the last fit in a terminal, with the saved TOML."""
+        """The command that repeats the last fit in a terminal, in the saved result folder."""
         assert self.worker is not None
         files = self.given, "--specimen", SAVED_TOML
         return shlex.join(["foamfit", "fit", *files, *self.worker.job.arguments])

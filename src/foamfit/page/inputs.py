@@ -137,7 +137,8 @@ class Field:
 # Options shown at once, and options folded away; tick boxes stand for --fix and --vary.
 CYCLES = ("cycle", "cycles")  # shown if a record has several
 SHOWN = ("model", "drive", "relaxation", *CYCLES)
-FOLDED = (*FREED, "starts", "max_time", "seed", "interior_mass", "time_shift", "intervals", "draws")
+APART = (*SHOWN, "specimen", "fix", "vary")
+FOLDED = [name for name, one in OPTIONS.items() if not one.python_only and name not in APART]
 # Options that change the curves of a model.
 OF_CURVES = ("drive", "relaxation", "interior_mass", "time_shift", *FREED)
 
