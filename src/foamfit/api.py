@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import TYPE_CHECKING, Unpack
 
 import lmfit
@@ -142,23 +141,15 @@ def fit(
         raise InputError("params must be lmfit.Parameters, as foamfit.make_params returns them")
     chosen = Options.of("fit", options)
     progress, tell = progress or (lambda *_: None), tell or (lambda _: None)
-    if model == "auto":
-        chosen.check_auto(params=params is not None, priors=measurement.priors)
-    else:
-        chosen.parse(model)
-    compile_once = cache(lambda: compile_solver(model))
-
-    def shown(share: float, what: str) -> None:
-        compile_once()  # before the first simulation, after the arguments were checked
-        progress(share, what)
-
+    chosen.check(measurement, model, params)  # before anything is compiled
+    compile_solver(model)
     if model == "auto":
         from foamfit.auto import compare_models
 
-        found = compare_models(measurement, chosen, shown, tell)
+        found = compare_models(measurement, chosen, progress, tell)
     else:
-        searched = identify(measurement, model, params, chosen, part_of(shown, 0.0, SEARCHED))
-        found, _ = judge(searched, chosen.choice, tell, part_of(shown, SEARCHED, 1.0))
+        searched = identify(measurement, model, params, chosen, part_of(progress, 0.0, SEARCHED))
+        found, _ = judge(searched, chosen.choice, tell, part_of(progress, SEARCHED, 1.0))
         progress(1.0, "done")
     stored = chosen.stored(measurement, model) if params is None else None
     return FitResult(**vars(found) | {"options": stored})

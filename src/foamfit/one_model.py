@@ -105,12 +105,14 @@ class Options(Given):
         """Return the drive, which by default depends on the test."""
         return self.drive or choose_drive(measurement, self.vary)
 
-    def check(self, measurement: Measurement, model: str) -> None:
+    def check(
+        self, measurement: Measurement, model: str, params: lmfit.Parameters | None = None
+    ) -> None:
         """Reject options that the test or the model does not allow, before any simulation."""
         if self.time_shift:
             check_time_shift(measurement, self.drive_for(measurement))
         if model == "auto":
-            self.check_auto()
+            self.check_auto(params=params is not None, priors=measurement.priors)
         else:
             self.parse(model)
             self.params(measurement, model)

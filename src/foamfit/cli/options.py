@@ -251,7 +251,6 @@ def compile_solver(quiet: bool, model: str = "bistable") -> None:
         logging.getLogger("foamfit").setLevel(logging.ERROR)
 
     def tell() -> None:
-        if not quiet:
-            say(f"foamfit: {cache.compiling('the solver')}", err=True)
+        say(f"foamfit: {cache.compiling('the solver')}", err=True)
 
-    precompile.compile_solver(model, tell)
+    precompile.compile_solver(model, None if quiet else tell)
