@@ -299,26 +299,24 @@ ENTRY = re.compile(r"\b(\w+) = \{ ?(column = [^{}…]+?) ?\}")
 class Preview(NamedTuple):
     """Headers of a file, and its curves as a PNG, or why they cannot be read."""
 
-    headers: tuple[str, ...] = ()
-    picture: bytes | None = None
+    headers: tuple[str, ...]
+    picture: bytes | None
     why: str = ""
 
 
 def preview(csv: Path, rest: str) -> Preview:
     """Return what can be shown of a file with the TOML of its columns, `rest`."""
+    headers: tuple[str, ...] = ()
     try:
         source = Source.of(read_text(csv, "a table"), {}, {})
         headers = tuple(header.text for header in source.table.headers if header.text)
-    except InputError:
-        return Preview()
-    try:
         with tempfile.TemporaryDirectory() as folder:
             toml, document = Path(folder, "test.toml"), _document(rest)
             toml.write_text(tomli_w.dumps(document | UNIT), encoding="utf-8")
             columns = {*source.columns, *document.get("columns", {})}
             return Preview(headers, _picture(csv, toml, columns))
     except InputError as error:
-        return Preview(headers, None, str(error))
+        return Preview(headers, None, str(error) if headers else "")
 
 
 def _picture(csv: Path, toml: Path, columns: Collection[str]) -> bytes:
@@ -338,15 +336,12 @@ def _picture(csv: Path, toml: Path, columns: Collection[str]) -> bytes:
 
 def remedies(message: str) -> dict[str, tuple[str, dict[str, Any]]]:
     """Return the entries of [columns] that a message proposes, by the words of their buttons."""
-    found = [
-        (channel, tomllib.loads(f"entry = {{ {content} }}")["entry"])
-        for channel, content in ENTRY.findall(message)
-    ]
-    units = (f" in {entry['unit']}" if "unit" in entry else "" for _, entry in found)
-    return {
-        f"Use {one[1]['column']}{unit} as {one[0]}": one
-        for one, unit in zip(found, units, strict=True)
-    }
+    found = {}
+    for channel, content in ENTRY.findall(message):
+        entry = tomllib.loads(f"entry = {{ {content} }}")["entry"]
+        unit = f" in {entry['unit']}" if "unit" in entry else ""
+        found[f"Use {entry['column']}{unit} as {channel}"] = channel, entry
+    return found
 
 
 def with_column(rest: str, channel: str, entry: Mapping[str, Any]) -> str:
