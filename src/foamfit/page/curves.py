@@ -33,7 +33,6 @@ class Curves:
         self.turning: Turning | None = None
         self.held: dict[str, bool] = {}  # by parameter: whether the user has fixed it
         self.found: dict[str, Any] = {}  # parameters of the fit, as in fit.json
-        self._rows: dict[str, Row] = {}
         self._scales: dict[str, tuple[float, float]] = {}
         self._measured = {name: ColumnDataSource({"x": [], "y": []}) for name in PANELS}
         # With one source for all panels each move needs one message.
@@ -55,11 +54,10 @@ class Curves:
     def show(self, turning: Turning) -> None:
         """Show another model or test, with its sliders."""
         self.turning = turning
-        self._rows = {row.name: row for row in turning.rows}
         self._show_measured(turning)
         self.sliders.rows = [
             vars(row) | {"held": self.held.get(row.name, row.held)} | self._spans(row)
-            for row in turning.rows
+            for row in turning.rows.values()
         ]
         self.sliders.waiting = False
         self._draw({})
@@ -73,13 +71,13 @@ class Curves:
     def put(self, values: Mapping[str, float]) -> None:
         """Draw the curves at other values (SI), and move the sliders to them."""
         self._draw(values)
-        rows = self._rows
+        rows = {} if self.turning is None else self.turning.rows
         self.sliders.show({n: v / rows[n].factor for n, v in values.items() if n in rows})
 
     def hide(self) -> None:
         """Hide everything."""
         self.sliders.tell("")
-        self.turning, self._rows = None, {}
+        self.turning = None
         self.sliders.param.update(rows=[], waiting=False)
         self._panels.visible = False
 
@@ -92,7 +90,7 @@ class Curves:
         if self.turning is None:
             return held, varied
         now, usual = self.turning.named, self.turning.problem.params
-        for name, row in self._rows.items():
+        for name, row in self.turning.rows.items():
             if not self.held.get(name, row.held):
                 varied += [name] if row.held else []
             elif not row.held or now[name] != usual[name].value:
@@ -157,7 +155,7 @@ class Curves:
     def _moved(self, event: Any) -> None:
         """Draw the curves for the sliders that were moved, and store the ticks."""
         moves, held = event.data.get("moves", {}), event.data.get("held", {})
-        rows = self._rows
+        rows = {} if self.turning is None else self.turning.rows
         self.held |= {name: value for name, value in held.items() if name in rows}
         if wanted := {n: value * rows[n].factor for n, value in moves.items() if n in rows}:
             self._draw(wanted)

@@ -69,7 +69,7 @@ class Turning:
         """Start at `values` (SI), or at values read off the loop; `options` as for a fit."""
         self.problem: Problem = Options(**options).problem(measurement, model)
         self.values = self._guess() if not values else self._at(self.problem.vector(), values)
-        self.rows = [self._row(name) for name in self.problem.names if self._own(name)]
+        self.rows = {name: self._row(name) for name in self.problem.names if self._own(name)}
 
     @property
     def drive(self) -> str:
