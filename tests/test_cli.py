@@ -353,7 +353,7 @@ def test_init_asks_for_the_rest(here: Path, header: str, answers: dict[str, str]
         (["--starts", "1000000000"], ("--starts", "x<=100000")),
         (["--relaxation", "999"], ("--relaxation", "x<=10")),
         (["--model", "+".join(["linear"] * 99)], ("99 springs", "20 at most")),
-        (["--draws", "1000000000"], ("--draws", "x<=100000")),
+        (["--mcmc", "1000000000"], ("--mcmc", "x<=100000")),
         (["--cycle", "1,99"], ("no cycle 99", "1 to 1")),
         (["--seed", "-1"], ("'--seed'", "x>=0")),
         (["--max-time", "-1"], ("max_time", "positive")),

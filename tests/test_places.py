@@ -82,8 +82,8 @@ def content(folder: str | Path) -> dict[str, Any]:
         ("--interior-mass --model linear+bistable", "linear+bistable-interior-mass"),
         ("--time-shift", "bistable-time-shift"),
         ("--starts 2 --seed 3 --max-time 60", "bistable-max-time-60-seed-3-starts-2"),
-        ("--intervals profile", "bistable-profile"),
-        ("--intervals mcmc --draws 500", "bistable-mcmc-draws-500"),
+        ("--profile", "bistable-profile"),
+        ("--mcmc 500", "bistable-mcmc-draws-500"),
     ],
 )
 def test_the_name_has_the_model_and_every_option_that_changes_the_numbers(

@@ -23,7 +23,7 @@ from foamfit.fitting.minima import in_order, scan_places, settle_ends
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params, make_problem
 from foamfit.fitting.search import STOPPING, SearchRecord, SearchStoppedError, Tracker, what_stopped
 from foamfit.fitting.starts import carried
-from foamfit.options import FREED, STARTS, STARTS_IN_SERIES, Given, Watch
+from foamfit.options import DRAWS, FREED, STARTS, STARTS_IN_SERIES, Given, Watch
 from foamfit.results import Fit, Intervals
 from foamfit.solve.cache import SPENT
 from foamfit.springs.model import Model, with_options
@@ -63,7 +63,7 @@ class Options(Given):
     @property
     def choice(self) -> Choice:
         """The method of the intervals."""
-        return Choice(self.intervals, self.draws, self.seed)
+        return Choice(self.intervals, self.draws or DRAWS, self.seed)
 
     @property
     def of_springs(self) -> dict[str, bool]:
@@ -85,7 +85,7 @@ class Options(Given):
             every |= {name: every[name] or is_set for name, is_set in parsed.options.items()}
         every["fix"] = dict(sorted((self.fix or {}).items()))
         every["vary"] = sorted(set(self.vary))
-        every["draws"] = self.draws if self.intervals == "mcmc" else None
+        every["draws"] = self.choice.draws if self.intervals == "mcmc" else None
         with suppress(InputError):  # a test without a drive is refused by the fit
             if self.drive and self.drive == choose_drive(measurement, self.vary):
                 every["drive"] = None

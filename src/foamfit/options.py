@@ -23,9 +23,11 @@ Watch = Callable[[Any, Any], None]
 F = TypeVar("F", bound=Callable[..., Any])
 
 DRIVES = ("impact", "stress", "displacement")
+METHODS = ("auto", "local", "profile", "mcmc")  # of the intervals
 # Start points per spring, per spring if several are hysteretic, and the largest number in all.
 STARTS, STARTS_IN_SERIES, MOST_STARTS = 16, 24, 100_000
 MOST_TERMS = 10  # relaxation terms
+DRAWS, LEAST_DRAWS, MOST_DRAWS = 2000, 100, 100_000  # steps of a Markov chain
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class Option:
     metavar: str = ""  # of the value on the command line
     like: str = ""  # an example of a mapping
     python_only: bool = False
+    command_only: bool = False
     frees: tuple[str, ...] = ()  # parameters of some springs that it frees
 
     @property
@@ -137,14 +140,15 @@ class Given:
         "Method of the 95 % intervals: auto is the local covariance, and profiles of the "
         "parameters along which the cost is not parabolic and whose range is not wider.",
         "auto",
-        choices=("auto", "local", "profile", "mcmc"),
+        choices=METHODS,
+        python_only=True,
     )
-    draws: int = option(
-        "Number of steps of the Markov chain (mcmc).",
-        2000,
-        least=100,
-        most=100_000,
-        metavar="N",
+    draws: int | None = option(
+        "Number of steps of the Markov chain.",
+        least=LEAST_DRAWS,
+        most=MOST_DRAWS,
+        usual=str(DRAWS),
+        python_only=True,
     )
     weights: Mapping[str, float] | None = option(
         "Weight of each curve, by its name in `FitResult.misfit`.",
@@ -196,7 +200,7 @@ class Keywords(TypedDict, total=False):
     stiffening: bool
     mullins: bool
     intervals: str
-    draws: int
+    draws: int | None
     weights: Mapping[str, float] | None
     priors: Mapping[str, str | tuple[float, float]] | None
     watch: Watch | None
@@ -242,7 +246,19 @@ _BEFORE = (  # which test and which model
         "bistable",
     ),
 )
-OPTIONS = {one.name: one for one in _BEFORE} | OF_FIT
+_AFTER = (  # what the command calls two of the intervals
+    Option("profile", "bool", "95 % intervals by profile likelihood.", command_only=True),
+    Option(
+        "mcmc",
+        "int",
+        "95 % intervals by N steps of emcee.",
+        least=LEAST_DRAWS,
+        most=MOST_DRAWS,
+        metavar="N",
+        command_only=True,
+    ),
+)
+OPTIONS = {one.name: one for one in (*_BEFORE, *OF_FIT.values(), *_AFTER)}
 FREED = {name: one.frees for name, one in OF_FIT.items() if one.frees}
 
 
@@ -273,11 +289,12 @@ def table() -> str:
     ]
     for one in OPTIONS.values():
         command = "" if one.python_only else f"`{f'{one.flag} {one.metavar}'.strip()}`"
+        python = "" if one.command_only else f"`{one.name}`"
         default = (
             "off"
             if one.kind == "bool"
             else one.usual or str("" if one.default in (None, ()) else one.default)
         )
-        cells = (command, f"`{one.name}`", one.unit, default, one.right, one.told)
+        cells = (command, python, one.unit, default, one.right, one.told)
         lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
     return "\n".join(lines)

@@ -395,10 +395,10 @@ def test_the_result_says_what_made_each_interval(tmp_path: Path, monkeypatch):
 
 def test_the_command_makes_intervals_one_way_and_tells_the_cost(tmp_path: Path):
     call = ["fit", str(RECONSTRUCTION), "--starts", "2", "--out", str(tmp_path / "out")]
-    told = run_refused(*call, "--intervals", "bootstrap")
-    assert "'bootstrap' is not one of 'auto', 'local', 'profile', 'mcmc'" in told
+    told = run_refused(*call, "--profile", "--mcmc", "200")
+    assert "--profile and --mcmc exclude each other" in told
     assert not (tmp_path / "out").exists()
-    done = run(*call, "--intervals", "mcmc", "--draws", "100", "--json", "--no-report")
+    done = run(*call, "--mcmc", "100", "--json", "--no-report")
     assert "intervals by mcmc: 2626 simulations, about" in done.stderr
     content = json.loads(done.stdout)
     assert content["parameters"]["s1_kc"]["ci95_method"] == "MCMC"

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from foamfit.study.batch import Batch
     from foamfit.study.cycles import CycleFits
 
+# Options that are not keywords of `foamfit.fit`, and options that select its `intervals`.
+NO_KEYWORDS, WAYS = ("cycle", "cycles", "model"), ("profile", "mcmc")
 PATIENCE = 10  # s, time limit for a scheduler to answer
 
 fit_options = options.together(
@@ -45,7 +47,13 @@ def keywords_of(asked: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of a command as keywords of `foamfit.fit`."""
     if asked["cycle"] is not None and asked["cycles"] is not None:
         raise InputError("give either --cycle or --cycles, not both")
-    return {name: one for name, one in asked.items() if name not in ("cycle", "cycles", "model")}
+    given = {way: asked[way] for way in WAYS if asked[way] not in (None, False)}
+    if len(given) > 1:
+        names = " and ".join(f"--{way}" for way in given)
+        raise InputError(f"{names} exclude each other; choose one method for the intervals")
+    search = {name: one for name, one in asked.items() if name not in (*NO_KEYWORDS, *WAYS)}
+    way, draws = next(iter(given.items()), ("auto", None))
+    return search | {"intervals": way, "draws": None if draws is True else draws}
 
 
 @dataclass(frozen=True)

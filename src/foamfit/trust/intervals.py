@@ -52,7 +52,7 @@ Minima = Sequence[tuple[Array, Array, Array]]
 class Choice:
     """Requested intervals."""
 
-    method: str = "auto"  # see `foamfit.options`
+    method: str = "auto"  # one of `options.METHODS`
     draws: int = 0  # steps of the Markov chain
     seed: int = 0  # of the random numbers
     ranges: bool = True  # whether to compute ranges where there is model error
