@@ -79,8 +79,8 @@ HOPELESS = 1.1
 # Two of them take a minute even under a prescribed motion. They are skipped if the misfit of one,
 # with or without relaxation, is at most this fraction of the range.
 CLOSE = 0.01
-# The search for springs in series stops if the misfit after the first descents exceeds the misfit
-# of one spring by more than this factor: later descents reduce it by at most a fifth.
+# The search for springs in series stops if the misfit after the first descents exceeds that of a
+# model of no more springs by more than this factor.
 UNPROMISING = 1.5
 # Fraction of the run time that the comparison takes; the rest is for the selected model.
 CHOSEN = 0.9
@@ -173,7 +173,7 @@ class _Comparison:
         impact = self.options.drive == "impact"
         for group in LADDER if test.last_cycle is None else HISTORY:
             allowed = []
-            for model in sorted(group, key=lambda one: not (impact or one.relaxation)):
+            for model in group if impact else sorted(group, key=_in_turn):
                 why, count = "", len(model.kinds)
                 if inside >= count:
                     why = f"it has no mass {inside} inside, whose motion was measured"
@@ -263,19 +263,29 @@ class _Comparison:
         return Tried(result, damping, best, time.perf_counter() - began, predicted)
 
     def _look(self, damping: str, problem: Problem, values: Array) -> None:
-        """Stop the fit of a chain if its first descents are far worse than one spring.
+        """Stop the fit of a chain if its first descents are far worse than no more springs.
 
         Springs are compared with and without `damping` alike.
         """
         like = (one for one in self.tried if damping in (one.damping, "none"))
-        alone = (one for one in like if "+" not in one.result.model)
+        count = problem.model.name.count("+")
+        fewer = (one for one in like if one.result.model.count("+") <= count)
         found = misfit_of(problem.objective, problem.objective.residual(values))
-        best = min(alone, key=lambda one: one.misfit, default=None)
+        best = min(fewer, key=lambda one: one.misfit, default=None)
         if best is not None and found > UNPROMISING * best.misfit:
             raise _UnpromisingError(
                 f"its first descents miss the curves by {percent(found)} of the range, "
                 f"{best.name} by {percent(best.misfit)}"
             )
+
+
+def _in_turn(model: Model) -> tuple[bool, bool]:
+    """Return the rank of a model in its group along a given motion.
+
+    Relaxation is tried first, as it is quick there, and two springs with memory before two without,
+    which need many more starts and are stopped where they cannot come near.
+    """
+    return not model.relaxation, model.has_several and model.kinds[0] not in _SLOW
 
 
 def _is_damped(tried: Sequence[Tried]) -> bool:

@@ -23,7 +23,7 @@ from foamfit.results import Intervals, Profile
 from foamfit.springs.parameters import NUISANCE
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import NOTHING, WEAK
+from foamfit.trust.covariance import NOTHING, WEAK, Uncertainty
 from foamfit.trust.profile import BETTER, PLACED, SIDES, Refit, departures, trace
 
 # "auto" profiles a parameter if the root of the cost departs from a straight line by this share at
@@ -190,9 +190,9 @@ def _with_far(best: BestPoint, made: Intervals, tracker: Tracker) -> Intervals:
 def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
     """Return half widths at another minimum, (k,); NaN if noise cannot make it the best.
 
-    The cost is assumed to be a parabola about that minimum too. With model error the minima are
-    compared by the effect of noise e on the difference of their costs, 2 eᵀd, with d the difference
-    of their residuals.
+    The cost is assumed to be a parabola about that minimum too, with the noise of the best point.
+    With model error the minima are compared by the effect of noise e on the difference of their
+    costs, 2 eᵀd, with d the difference of their residuals.
     """
     if best.misfits:
         apart, objective = residual - best.residual, best.problem.objective
@@ -206,11 +206,11 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
         return np.full(left.shape, np.nan)
     other = BestPoint(best.problem, point, best.names)
     try:
-        halves = other.halves
+        own = Uncertainty((other.block(best.errors),), other.sizes).covariance
     except SimulationError:  # the stress along the measured motion need not exist there
         return np.full(left.shape, np.nan)
     with np.errstate(invalid="ignore"):
-        return np.where(left > 0.0, halves * np.sqrt(left), np.nan)
+        return np.where(left > 0.0, best.quantiles * own.stderr * np.sqrt(left), np.nan)
 
 
 def _by_profiles(
