@@ -19,7 +19,7 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.fitting import search
 from foamfit.fitting.curves import check_time_shift, choose_drive
-from foamfit.fitting.minima import in_order, scan_places, settle_ends
+from foamfit.fitting.minima import in_order, settle_ends
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params, make_problem
 from foamfit.fitting.search import STOPPING, SearchRecord, SearchStoppedError, Tracker, what_stopped
 from foamfit.fitting.starts import carried
@@ -327,7 +327,6 @@ def _search(
         space = problem.space()
         how: Any = {"rng": rng, "progress": progress, "known": known}
         costs = search.search(coarse, space, starts=record.starts, **how)
-        scan_places(coarse, space)
         best = [] if coarse.best_values is None else [coarse.best_values]
         return costs, [*best, *coarse.ends]
 

@@ -1,15 +1,13 @@
-"""Minima of the cost near the best point, which the search from start values may miss.
+"""Minima of the cost that other noise could have made the best, and the order of springs in them.
 
-The assignment of properties to the springs of a chain, and the place of A1 or ε_*, may depend on a
-few samples; the cost then has several minima of similar depth. The minima found here improve the
-best point, or show what the test leaves undetermined.
+Which properties belong to which spring of a chain may depend on a few samples; the cost then has
+several minima of similar depth. They show what the test leaves undetermined.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from operator import attrgetter
 
 import numpy as np
@@ -17,10 +15,8 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import Space
-from foamfit.fitting.levenberg import Iterate, following
-from foamfit.fitting.nuisance import CONTACT_TIME
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.search import MINIMA, Tracker, descend, halve, rank, squares
+from foamfit.fitting.search import MINIMA, Tracker, descend, halve, rank
 from foamfit.fitting.together import Layout, Together, fit_linked
 from foamfit.springs.laws.record import Law
 from foamfit.springs.model import exchanges
@@ -32,69 +28,9 @@ EXCHANGES, EXCHANGED = 8, 16
 # Ends of the search within NEAR noise variances of the best cost are refined, at most MINIMA of
 # them. Points of the box closer than SAME are one minimum.
 NEAR, SAME = 40.0, 0.02
-# Steps of a scan. STEP and SHORTEST: first and shortest step, as a fraction of the box. STEPS: most
-# steps to each side, halved above the noise floor, where nearby minima are equally good.
-STEP, SHORTEST, STEPS = 0.04, 0.015, 12
 # Largest change of the residual, over the largest residual, by an order of springs that changes
 # nothing; simulated impacts differ by up to 3e-5. SAME_COST: the relative change of the cost.
 SAME_CURVES, SAME_COST = 1e-4, 1e-5
-CONTACT_STEP = 0.12  # first step of the contact time: about the error of the first rise
-# Changes of the cost, in residual variances: above TOO_HIGH a step is halved, below FLAT the next
-# one is doubled (until one has been halved), and below NOTHING the scan ends.
-TOO_HIGH, FLAT, NOTHING = 300.0, 4.0, 0.05
-
-
-def scan_places(tracker: Tracker, space: Space) -> None:
-    """Move ε_a or ε_* in steps and descend from each; the tracker keeps the best point.
-
-    At each step the other parameters are fitted first, then all parameters. The contact time of an
-    impact without a measured motion is scanned as well, because with a dashpot a wrong one may fit
-    almost as well. Above the noise floor only better ends are kept.
-    """
-    if tracker.best_values is None:
-        return
-    best, cost, met = tracker.best_values, tracker.best_cost, [space.encode(tracker.best_values)]
-    left = max(cost, tracker.objective.floor) / tracker.objective.n_data
-    at_noise = cost <= tracker.objective.floor
-    scanned = {law.scanned for law in space.model.laws}
-    if "displacement_time" not in tracker.objective.counted:
-        scanned.add(CONTACT_TIME)
-    for column, one in enumerate(space.coordinates):
-        for sign in (1.0, -1.0) if one.short in scanned else ():
-            first = CONTACT_STEP if one.short == CONTACT_TIME else STEP
-            values, step, growth, before = best, sign * first, 2.0, cost
-            for _ in range(STEPS if at_noise else STEPS // 2):
-                point = _moved(tracker, space, space.encode(values), column, step)
-                if point is None:
-                    break
-                free = tuple(name for name in space.free if name != space.names[one.place])
-                fixed = replace(space, values=space.decode(point), free=free)
-                now, point = descend(tracker, fixed, fixed.encode(fixed.values), 30, enough=1e-4)
-                if now > cost + TOO_HIGH * left:
-                    step, growth = 0.5 * step, 1.0
-                    if abs(step) < SHORTEST:
-                        break
-                    continue
-                change, values, before = abs(now - before), fixed.decode(point), now
-                if change < NOTHING * left:
-                    break
-                step *= growth if change < FLAT * left else 1.0
-                now, end = descend(tracker, space, space.encode(values), 60)
-                if not _among(met, end) and (at_noise or now < cost):
-                    met.append(end)
-                    tracker.ends.append(space.decode(end))
-
-
-def _moved(tracker: Tracker, space: Space, point: Array, column: int, share: float) -> Array | None:
-    """Move one coordinate by a fraction of the box, the others following; None outside it."""
-    (low, high), (residual, jacobian) = space.box, squares(tracker, space)
-    held = np.arange(point.size) == column
-    shift = np.where(held, share * (high - low), 0.0)
-    if not low[column] < (point + shift)[column] < high[column]:
-        return None
-    at = Iterate(point, residual(point), jacobian(point))
-    steps = following(at, shift, held)
-    return rank(tracker, space, [np.clip(point + step, low, high) for step in steps])[0][1]
 
 
 def joint_minima(found: Together) -> list[Together]:

@@ -30,7 +30,7 @@ OVER_SCALE = 0.2
 # Ends of the search from which a descent begins on all samples or once parameters are held, and
 # their largest cost over the best one.
 MINIMA, NEAR = 12, 1.5
-ITERATIONS = 60  # of such a descent
+ITERATIONS, ENOUGH = 60, 1e-3  # of such a descent, and its relative gain at the end
 LEFT = 1e-6  # predicted gain of the sum of squares at which a refinement ends
 SHOWN = 3.0  # standard errors from the zero of the file, from which the fitted one is another
 # Largest RMS deviation from the record over that of plain least squares.
@@ -73,7 +73,8 @@ def descend_again(problem: Problem, tracker: Tracker) -> None:
     ranked = rank(tracker, space, [space.encode(values) for values in starts])
     near = [one for one in ranked if one[0] <= NEAR * ranked[0][0]]
     for _, point in distinct(near)[:MINIMA]:
-        tracker.ends.append(space.decode(descend(tracker, space, point, ITERATIONS)[1]))
+        end = descend(tracker, space, point, ITERATIONS, ENOUGH)[1]
+        tracker.ends.append(space.decode(end))
     refine(problem, tracker)
 
 

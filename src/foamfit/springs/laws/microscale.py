@@ -320,7 +320,6 @@ def _law(*options: str) -> Law:
         read_off=read_off,
         marks=7 + len(names),
         onset=lambda values: values[3],
-        scanned="eps_star",
         neighbours=_neighbours,
         exchanged=None if options else (_to_stresses, _from_stresses),
         note=_NOTE + softened,
