@@ -44,7 +44,6 @@ LARGEST_STRAIN = 0.999  # of the measured motion, with its zero taken off
 _NEAR = 12  # the speed at contact is that over this part of the way to the turn
 _OUTSIDE = 0.1  # of that part: a contact outside the record is far from it
 _FIRST = 3  # rows that show the stress at which a record begins
-_LOW = 0.1  # fraction of the peak stress below which a contact may have been overlooked
 
 
 @dataclass(frozen=True)
@@ -195,22 +194,8 @@ def limits_of(
     else:
         reach = (LARGEST_CONTACT if name == CONTACT_TIME else LARGEST_SHIFT) * duration
     at = middle if rise is None else rise.mean
-    latest = _latest_contact(measurement) if name == CONTACT_TIME and rise is None else 0.0
-    low, high = min(at - reach, middle), max(at + reach, middle + latest)
+    low, high = min(at - reach, middle), max(at + reach, middle)
     if name == "displacement_zero" and measurement.displacement is not None:
         least = float(measurement.displacement.max()) - LARGEST_STRAIN * measurement.specimen.height
         low = min(max(low, least), 0.0)
     return low, high
-
-
-def _latest_contact(measurement: Measurement) -> float:
-    """Return the latest possible contact of a record without a rest period, or 0.
-
-    If its motion does not begin at zero, the record may begin before the contact, which can then be
-    anywhere while the stress is low.
-    """
-    time, stress = measurement.time, measurement.stress
-    elsewhere = bool(measurement.origins.get("displacement_zero"))
-    if time is None or stress is None or measurement.contact != "file" or not elsewhere:
-        return 0.0
-    return float(time[np.argmax(stress > _LOW * stress.max())])
