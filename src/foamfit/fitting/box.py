@@ -21,7 +21,8 @@ from foamfit.data.measurement import Measurement
 from foamfit.fitting import nuisance
 from foamfit.springs.laws.record import Between, Param
 from foamfit.springs.model import Model
-from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
+from foamfit.springs.parameters import NUISANCE, any_param, family, split_name, unit_of
+from foamfit.text import engineering
 
 # Sets the parameters that depend on others through expressions, in place, in a vector (n,) or in
 # each column (n, m).
@@ -120,36 +121,11 @@ def others(name: str, param: Param, values: dict[str, float]) -> list[float]:
     return [values[f"{prefix}_{short}"] for short in param.of]
 
 
-SCALES_IN_WORDS = {
-    "stress": "the largest stress",
-    "slope": "the largest stress over strain",
-    "damping": "the damping that would carry the whole stress",
-    "duration": "the time under load",
-}
-NUISANCE_IN_WORDS = {
-    "time_shift": "a hundredth of the time under load",
-    "contact_time": "a hundredth of the time under load",
-    "stress_zero": "a hundredth of the largest stress",
-    "displacement_zero": "a hundredth of the largest displacement",
-    "acceleration_zero": "a hundredth of the height over the squared time under load",
-}
-
-
 def scale_in_words(name: str, value: float, scale: float) -> str:
-    """Return the scale of a parameter in words."""
+    """Return the scale of a parameter in words: its value, or a number with its unit."""
     if math.isclose(scale, abs(value), rel_tol=1e-9):
         return "its value"
-    if name in NUISANCE:
-        return NUISANCE_IN_WORDS.get(name, "its value")
-    param = any_param(split_name(name)[1])
-    if not param.least_size:
-        return "its value"
-    if param.least_size == 1.0:
-        return "its largest admissible size"
-    share = "a tenth" if param.least_size == 0.1 else f"{param.least_size:g}"
-    if param.scale == "one":
-        return f"{param.least_size:g}"
-    return f"{share} of {SCALES_IN_WORDS[param.scale]}"
+    return engineering(scale, unit_of(name))
 
 
 # Order of the coordinates that all springs have; they follow those of the law.
@@ -177,14 +153,6 @@ class Coordinate(NamedTuple):
         if isinstance(self.ends, Between):
             return self.ends.ends(*[float(values[place]) for place in self.of])
         return self.ends
-
-    def value(self, u: float, values: Array | list[float]) -> float:
-        """Return the parameter at coordinate `u`, ignoring its limits.
-
-        `values` must contain the parameters that its ends depend on.
-        """
-        first, last = self.ends_at(values)
-        return math.exp(u) * last if self.is_logarithmic else first + u * (last - first)
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,11 +65,6 @@ def factor(kind: str, b: float, x: float) -> tuple[float, float]:
     return (value, x) if value > LEAST_FACTOR else (LEAST_FACTOR, 0.0)
 
 
-def law_values(kind: str, v: float, b: float, x: Array) -> Array:
-    """Return the values of several tests according to a rate law."""
-    return np.array([v * factor(kind, b, float(one))[0] for one in x])
-
-
 def start_of(kind: str, values: Array, x: Array) -> tuple[float, float]:
     """Return the common value and slope of the rate law fitted to the values of some tests.
 
@@ -85,6 +80,6 @@ def start_of(kind: str, values: Array, x: Array) -> tuple[float, float]:
         slope, v = np.polyfit(x, values, 1)
         slope = slope / v if v else 0.0
     slope = float(np.clip(slope, -STEEPEST, STEEPEST))
-    if not np.isfinite(v) or v == 0.0 or np.min(law_values(kind, 1.0, slope, x)) <= 1e-3:
+    if not np.isfinite(v) or v == 0.0 or min(factor(kind, slope, one)[0] for one in x) <= 1e-3:
         return middle, 0.0
     return float(v), slope

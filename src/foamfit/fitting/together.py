@@ -63,11 +63,6 @@ class Term:
     commons: NDArray[np.intp]  # Indices of the coordinates ln(common value)
     weights: Array
 
-    @property
-    def size(self) -> int:
-        """Number of residuals of the test, including priors and pulls."""
-        return self.objective.n_data + len(self.objective.priors) + self.pulled.size
-
     @cached_property
     def all_places(self) -> NDArray[np.intp]:
         """Indices of all coordinates on which the residual depends."""
