@@ -113,8 +113,7 @@ def test_a_law_of_rate_is_recovered_whatever_its_coordinate_is(kind, name):
     """The fit uses kh_plus itself, the logarithm of k0, and eps_c relative to another parameter."""
     v, b = getattr(SPRING, name), -0.05
     law = {LOG_RATE: lambda v, b: v * (1.0 + b * X), POWER_RATE: lambda v, b: v * np.exp(b * X)}
-    changes = [{name: value} for value in law[kind](v, b)]
-    tests = problems(changes)
+    tests = problems([{name: value} for value in law[kind](v, b)])
     starts = [vectors(tests, [{"eps_a": 0.135}] * 3)]
     kinds = dict.fromkeys(tests[0].free(), "shared") | {f"s1_{name}": kind}
     found = fit_linked(tests, Links(kinds, X), starts)
