@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from operator import attrgetter
 from typing import Any
 
 import lmfit
@@ -74,7 +73,6 @@ HISTORY = (
 WITHOUT_GAIN = 2
 # Chains of springs with memory take minutes in an impact. They are skipped if the misfit of one
 # such spring exceeds the misfit of one spring without memory by more than this factor.
-# So is a chain with a linear spring if the one without it exceeds the best model by that factor.
 HOPELESS = 1.1
 # Two of them take a minute even under a prescribed motion. They are skipped if the misfit of one,
 # with or without relaxation, is at most this fraction of the range.
@@ -210,8 +208,8 @@ class _Comparison:
                     return
                 if self.stopped:
                     return
-            if len(self.tried) > below:
-                idle = 0 if _has_gained(self.tried, below) else idle + 1
+            if len(self.tried) > below > 0:
+                idle = 0 if evidence.choose(self.tried).best >= below else idle + 1
             if idle == WITHOUT_GAIN:
                 self.ended = f"{WITHOUT_GAIN} groups of richer models in a row brought no gain"
                 return
@@ -313,11 +311,6 @@ def _hopeless(model: Model, tried: Sequence[Tried], unpromising: Sequence[Model]
         if Counter(poor.kinds) <= Counter(model.kinds):
             return f"the first descents with {poor.name} were poor"
     slow = [kind for kind in model.kinds if kind in _SLOW]
-    core = [t for t in tried if "+" in t.result.model and f"linear+{t.result.model}" == model.words]
-    best = min(tried, key=attrgetter("misfit"), default=None)
-    if best and any(one.misfit > HOPELESS * best.misfit for one in core):
-        misses = f"{core[0].name} misses the curves by {percent(core[0].misfit)} of the range"
-        return f"{misses}, {best.name} by {percent(best.misfit)}"
     if any(model.options.values()):
         (one, told), (other, against) = least([model.words]), least(_QUICK)
         return f"{told}, {against}" if HOPELESS * one > other else ""
@@ -328,17 +321,6 @@ def _hopeless(model: Model, tried: Sequence[Tried], unpromising: Sequence[Model]
         return f"{told} only"
     (one, told), (other, against) = least(slow, 0), least(_QUICK, 0)
     return f"{told}, {against}" if one > HOPELESS * other else ""
-
-
-def _has_gained(tried: Sequence[Tried], below: int) -> bool:
-    """Return whether a model from index `below` on is selected or strongly preferred."""
-    if below == 0:
-        return True
-    decision = evidence.choose(tried)
-    if decision.best >= below or decision.by_prediction:
-        return decision.best >= below
-    each = zip(*((one.aicc, one.bic) for one in decision.criteria), strict=True)
-    return any(min(values[below:]) < min(values[:below]) - MARGIN for values in each)
 
 
 # ---------------------------------------------------------------- the result
