@@ -33,7 +33,6 @@ DESCENTS, ON_CURVES, REFINED = 0.25, 0.75, 0.95
 # Largest number of rounds; see `_settled`.
 ATTEMPTS = 3
 FOUND_AGAIN = 0.02  # relative difference of the costs of descents that agree on the best end
-NOISY = 0.005  # noise of a motion, as a fraction of its range, above which it is smoothed
 MISSING = 0.8  # fraction of the noise floor up to which a cost is mere noise
 # Hops in a row on the curves that find nothing better, which ends them: of one spring, and where
 # there are many minima: of springs in series, or if the cost exceeds LOST noise floors (one in an
@@ -212,22 +211,6 @@ def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[floa
     )
 
 
-def spread_out(space: Space, points: list[Array], count: int) -> list[Array]:
-    """Return `count` of the ranked points, the best one of each range of `Law.strata` among them.
-
-    If branches d and a have similar stiffness, the cost has several minima that differ in ε_a.
-    """
-    wanted = {law.strata for law in space.model.laws}
-    marks = [j for j, one in enumerate(space.coordinates) if one.short in wanted]
-    if not marks:
-        return points[:count]
-    places = np.array([point[marks[0]] for point in points])
-    strata = np.searchsorted(np.quantile(places, np.linspace(0, 1, count + 1)[1:-1]), places)
-    first = np.sort(np.unique(strata, return_index=True)[1]).tolist()
-    chosen = list(dict.fromkeys([*first, *range(len(points))]))[:count]
-    return [points[i] for i in sorted(chosen)]
-
-
 def distinct(ends: list[tuple[float, Array]]) -> list[tuple[int, Array]]:
     """Return the distinct minima among the ends of descents, best first: count and one end each.
 
@@ -259,8 +242,6 @@ def search(
             points = [point for _, point in found]
             counts = {id(point): count for count, point in found}
         ranked = rank(tracker, space, points)
-        if counts and attempt == 0 and tracker.objective.drive != "impact":
-            tracker.look()  # the loop of an impact has other curves
         points = [point for _, point in distinct(ranked)][:most]
         for i, point in enumerate(points):
             progress(ON_CURVES + (REFINED - ON_CURVES) * i / len(points), "curves")
@@ -335,9 +316,8 @@ def _search_loop(
     Start values read off the loop are added to `points`. The best point of the loop is passed to
     the tracker even if the search is stopped.
     """
-    objective, followed = tracker.objective, None
-    if _is_noisy(objective) and objective.motion is not None:
-        followed = objective.motion.at(objective.time)
+    objective = tracker.objective
+    followed = None if objective.motion is None else objective.motion.at(objective.time)
     loop = thinned(objective.measurement, followed, loop=True)
     along = Objective(
         loop, objective.model, "displacement", {"stress_strain": 1.0},
@@ -357,7 +337,7 @@ def _search_loop(
                 tracker.consider(inner.best_values)
                 tracker.look()
 
-        ends = halve(squares(inner, own), own.box, spread_out(own, points, starts), step)
+        ends = halve(squares(inner, own), own.box, points[:starts], step)
         if own.model.has_several and not own.model.relaxation:
             ends = hop(own, ends, squares(inner, own), rng, under_stress(inner, own))
         ends = [(cost, space.encode(own.decode(end))) for cost, end in ends]
@@ -398,12 +378,3 @@ def under_stress(tracker: Tracker, space: Space) -> Way:
         ).point  # fmt: skip
 
     return stretched
-
-
-def _is_noisy(objective: Objective) -> bool:
-    """Return whether the loop needs a smoothed motion: if it drives, or is noisy."""
-    test = objective.measurement
-    motion, level = test.displacement, test.noise.of("displacement")
-    if objective.drive != "impact" or motion is None or level is None:
-        return objective.drive == "displacement"
-    return bool(level.sigma > NOISY * np.ptp(motion))

@@ -225,18 +225,4 @@ def _carried_one(
             start[at] = neutral
         elif spring >= 0 and spring not in sources:
             start[at] = space.low[at] if short == "height" else 0.1 * space.high[at]
-    start = space.complete(start)
-    before, now = _heights(below, values), _heights(space, start)
-    for spring, place in sources.items():  # the same stresses and elongations
-        law = space.model.laws[spring]
-        if law.exchanged is not None and now[spring] != before[place]:
-            own = space.model.own(spring, start)[:-1]
-            own[:] = law.exchanged[1](law.exchanged[0](own, before[place]), now[spring])
-    return start
-
-
-def _heights(space: Space, values: Array) -> list[float]:
-    """Return the heights of the springs, m."""
-    given = dict(zip(space.names, values.tolist(), strict=True))
-    names = [f"s{i}_height" for i in range(1, len(space.model.kinds) + 1)]
-    return [given.get(name, space.scales.height) for name in names]
+    return space.complete(start)

@@ -305,7 +305,6 @@ LAW = Law(
     read_in_series=read_in_series,
     ways=2,
     onset=lambda values: _sigma_a(values[0], values[3]),
-    strata="eps_a",
     neighbours=_neighbours,
     likely=_likely,
     fewer=_fewer,

@@ -182,7 +182,6 @@ class Law:
     #: stress of the first snap as a function of the parameters, by which interchangeable springs
     #: are sorted; by default the first parameter
     onset: Callable[..., float] | None = None
-    strata: str = ""  #: parameter over whose range start points are spread
     #: neighbours(values, largest stress): parameters of springs with nearly the same loop, which
     #: the search tries as further start points
     neighbours: Callable[[Array, float], Iterator[Array]] = _no_neighbours
