@@ -44,14 +44,14 @@ def grouped(ends: Sequence[End], alike: float) -> list[list[End]]:
 
 def hop(
     space: Space, ends: Sequence[End], functions: Functions, rng: np.random.Generator,
-    *more: Way, patience: int = PATIENCE,
+    patience: int = PATIENCE,
 ) -> list[End]:  # fmt: skip
     """Descend from children of the best ends until `patience` in a row are no better.
 
-    `functions` are the residual and its derivative; `WAYS`, for springs in series `IN_SERIES`
-    too, and `more` of them say how a child is made of two ends. Return all ends.
+    `functions` are the residual and its derivative; `WAYS`, and for springs in series `IN_SERIES`,
+    say how a child is made of two ends. Return all ends.
     """
-    ways = *WAYS, *(IN_SERIES if space.model.has_several else ()), *more
+    ways = *WAYS, *(IN_SERIES if space.model.has_several else ())
     pool, failed, out = [group[0] for group in grouped(ends, DIFFERENT)][:POOL], 0, [*ends]
     while failed < patience:
         best = pool[0][0]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
-from foamfit.fitting.hops import ALIKE, Functions, Way, grouped, hop
+from foamfit.fitting.hops import ALIKE, Functions, grouped, hop
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.starts import BOX_STARTS, Reading, box_starts, thinned
 from foamfit.springs.model import exchanges, neighbours
@@ -38,8 +38,6 @@ MISSING = 0.8  # fraction of the noise floor up to which a cost is mere noise
 # there are many minima: of springs in series, or if the cost exceeds LOST noise floors (one in an
 # impact, as no law follows the waves in the specimen). MINIMA: the most minima that are kept.
 SHORT, LONG, LOST, MINIMA = 40, 160, 30.0, 24
-# Samples to each side from which the local slope of a loop is taken, and its limits over the mean.
-NEARBY, LEAST_SLOPE, LARGEST_SLOPE = 3, 0.02, 20.0
 # Stages of successive halving: iterations, the share of the starts that then goes on, and that of
 # the work.
 STAGES = ((8, 0.5, 0.5), (8, 0.25, 0.25), (24, 0.25, 0.25))
@@ -339,42 +337,9 @@ def _search_loop(
 
         ends = halve(squares(inner, own), own.box, points[:starts], step)
         if own.model.has_several and not own.model.relaxation:
-            ends = hop(own, ends, squares(inner, own), rng, under_stress(inner, own))
+            ends = hop(own, ends, squares(inner, own), rng)
         ends = [(cost, space.encode(own.decode(end))) for cost, end in ends]
     finally:
         if inner.best_values is not None:
             tracker.consider(inner.best_values)
     return ends
-
-
-def under_stress(tracker: Tracker, space: Space) -> Way:
-    """Return a way to a child that descends along the motion under the measured stress of a loop.
-
-    Under one stress the elongations of springs in series add up: each bends the curve at stresses
-    of its own. A descent there has other wrong minima than one along the motion, whose objective
-    `tracker` has. Each elongation that is missed is multiplied by the local slope of the loop, so
-    that it counts as the stress that is missed.
-    """
-    along, test = tracker.objective, tracker.objective.measurement
-    assert test.displacement is not None
-    assert test.stress is not None
-    motion, stress = test.displacement, test.stress
-    span, at = float(np.ptp(motion)), np.arange(motion.size)
-    under = Objective(
-        replace(test, noise=replace(test.noise, displacement=span)), along.model, "stress",
-        {"displacement_time": 1.0}, nuisance=along.nuisance, spent=along.spent,
-    )  # fmt: skip
-    ahead, behind = np.minimum(at + NEARBY, at[-1]), np.maximum(at - NEARBY, 0)
-    run = np.maximum(np.abs(motion[ahead] - motion[behind]), 1e-9 * span) / span
-    slope = np.abs(stress[ahead] - stress[behind]) / run / np.ptp(stress)
-    weight = np.clip(slope, LEAST_SLOPE, LARGEST_SLOPE) * along.span("stress_strain")
-    weight = weight[under.kept["displacement_time"]]
-    residual, jacobian = squares(Tracker(under, tracker.deadline), space, slice(under.n_data))
-
-    def stretched(_: Space, one: Array, *_others: object) -> Array:
-        return levenberg.descend(
-            lambda point: weight * residual(point), lambda point: weight[:, None] * jacobian(point),
-            one, space.box, 15, enough=ALIKE,
-        ).point  # fmt: skip
-
-    return stretched
