@@ -91,7 +91,6 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Return what was run, in order, with an empty cache."""
     done: list[Any] = []
     monkeypatch.setattr(precompile, "run", lambda *given: done.append(given))
-    monkeypatch.setattr(precompile, "SECOND", "")
     monkeypatch.setattr(cache, "compiled", lambda *_: False)
     return done
 
