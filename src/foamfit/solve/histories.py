@@ -35,7 +35,7 @@ def _given(law: Law, row: Array, history: Array, top: int, out: Array) -> tuple[
     scales = (most, np.abs(np.diff(history)).max(initial=0.0), most, 0.0)
     if top == STRESS:
         scales = 1e-3, 0.0, 1e-3, most
-    reals = np.array((0.0, 0.0, 0.0 if integrated else TOL, TOL, 1e9, 0.0, 0.0, 0.0, *scales))
+    reals = np.array((0.0, 0.0, 0.0 if integrated else TOL, TOL, 1e9, 0.0, 0.0, *scales))
     time = np.arange(history.size, dtype=float)
     return [*layout.memory(), row[None, :], _ONE, _ONE, reals, history, time, out], integrated
 

@@ -17,7 +17,7 @@ from foamfit.solve.compiled import run
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled import compiled, contract
 from foamfit.springs.compiled.contract import BY_STRESS, FADES, INTERNAL
-from foamfit.springs.laws.record import OWN_ETA, Law
+from foamfit.springs.laws.record import Law
 
 Memory = tuple[NDArray[np.int64], Array]  # the integers and floats of a run
 
@@ -118,16 +118,6 @@ def order(shape: Shape, numbers: np.recarray, nodes: int) -> tuple[list[int], li
     return places, groups, max(a + b for a, b in pairwise(sizes)) - 1
 
 
-def _owned(count: int, directions: list[list[int]]) -> list[int]:
-    """Return where the directions of each spring by its own parameters begin, and these."""
-    first: list[int] = []
-    listed: list[int] = []
-    for i in range(count):
-        first.append(count + 1 + len(listed))
-        listed += [j for j, (k, own) in enumerate(directions) if k == i and 0 <= own < OWN_ETA]
-    return [*first, count + 1 + len(listed), *listed]
-
-
 def _functions(
     shape: Shape, several: bool, internal: bool, fades: bool, relaxes: bool
 ) -> tuple[int, ...]:
@@ -198,7 +188,8 @@ def lay_out(shape: Shape) -> Layout:
     }  # fmt: skip
     arrays = (
         numbers.view(np.int64).tolist(), [0, *shape.ends], [k for pair in directions for k in pair],
-        _owned(count, directions), kinds, [0] * (run.SYSTEMS * size), places, groups_of,
+        [own if k == i else -1 for i in range(count) for k, own in directions],
+        kinds, [0] * (run.SYSTEMS * size), places, groups_of,
     )  # fmt: skip
     at = np.cumsum([0, *(lengths[name] for name in run.FLOATS)])
     whole = np.cumsum([run.WORDS, *map(len, arrays)])

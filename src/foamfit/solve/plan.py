@@ -20,7 +20,7 @@ from foamfit.solve.layout import Layout, Memory, Shape, lay_out
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM, NO_SWITCHES, Motion as Motion, Slopes
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled, slopes_of
-from foamfit.springs.compiled.contract import FLOWS, INTERNAL, TINY, Compiled
+from foamfit.springs.compiled.contract import FLOWS, INTERNAL, Compiled
 from foamfit.springs.laws.record import MOVED, OWN_RELAXATION, Law
 from foamfit.springs.spring import as_samples
 
@@ -73,11 +73,11 @@ def _laws(records: tuple[Law, ...]) -> Laws:
 
 @lru_cache(maxsize=64)
 def _numbers(
-    drag: float, speed: float, tol: float, most: int, brief: float, over: bool, followed: bool,
+    drag: float, speed: float, tol: float, most: int, brief: float, over: bool,
     least: tuple[float, ...],
 ) -> Array:  # fmt: skip
     """Return the numbers that the loop over time is given, see `loop`; they are only read."""
-    return np.array((drag, 1.0, speed, tol, most, brief, over, followed, *least))
+    return np.array((drag, 1.0, speed, tol, most, brief, over, *least))
 
 
 @dataclass(eq=False)  # a run reads it thirty times; a named tuple takes twice as long
@@ -181,7 +181,7 @@ class Plan:
                 return found
         log = np.empty((logged, 5)) if everything else NO_SWITCHES
         for degree in methods:
-            reals = self._reals(rows, heights, rtol, drag, degree, methods[-1] > degree)
+            reals = self._reals(rows, heights, rtol, drag, degree)
             _, told = self._integrate(rows, heights, damped, directions, out, log, reals, degree)
             outcome = told.item(OUTCOME)
             if outcome not in _STIFF:
@@ -209,9 +209,8 @@ class Plan:
         return (0, POINTS) if self.max_explicit < self.max_steps else (0,)
 
     def _reals(
-        self, rows: Array, heights: Array, rtol: float, drag: float, degree: int = 0,
-        followed: bool = False,
-    ) -> Array:  # fmt: skip
+        self, rows: Array, heights: Array, rtol: float, drag: float, degree: int = 0
+    ) -> Array:
         """Return the numbers that the loop over time is given; see `loop`."""
         least = self.least or (LEAST_OF_MASSES if len(self.ends) > 1 else LEAST_TOL)
         tol, most, brief, over = max(self.margin * rtol, least), self.max_steps, 0.0, False
@@ -232,7 +231,7 @@ class Plan:
             most = self.max_explicit
         speed = self.speed
         least_scales = (0.0, speed, 0.0, 0.0) if speed > 0.0 else self._scales(rows, heights)
-        return _numbers(drag, speed, tol, most, brief, over, followed, least_scales)
+        return _numbers(drag, speed, tol, most, brief, over, least_scales)
 
     def _integrate(
         self, rows: Array, heights: Array, damped: bytes, directions: Directions, out: Array,
@@ -340,9 +339,10 @@ class Plan:
         if self.terms:
             gain = 1.0 + rows[:, 1 : 1 + 2 * self.terms : 2].sum(axis=1)
             first, steep = gain * first, gain * steep
-        eta = [one if one > TINY else 0.0 for one in rows[:, 0].tolist()]
-        chain = first.tolist(), steep.tolist(), eta, heights.tolist(), self.ends, self.mass.tolist()
-        return rates.fastest_rates(*chain, drag, self.top, self.speed > 0.0, self._duration)
+        chain = first.tolist(), steep.tolist(), rows[:, 0].tolist(), heights.tolist()
+        nodes = self.ends, self.mass.tolist()
+        struck = self.speed > 0.0
+        return rates.fastest_rates(*chain, *nodes, drag, self.top, struck, self._duration)
 
 
 def _time(t: ArrayLike) -> Array:
@@ -356,6 +356,17 @@ def _time(t: ArrayLike) -> Array:
         what = "later than the one before it" if math.isfinite(time[at]) else "finite"
         raise InputError(f"t must be finite and increase; sample {at} is not {what}")
     return time
+
+
+def _check_viscous(laws: Laws, ends: tuple[int, ...], top: int) -> None:
+    """Raise InputError for a viscous law in a group of springs, whose stress would be unknown."""
+    nodes = {0, *(ends[:-1] if top in (scenes.STRESS, scenes.VISCOUS) else ends)}
+    for i, (law, made) in enumerate(zip(laws.records, laws.made, strict=True)):
+        if made.viscous and not {i, i + 1} <= nodes:
+            raise InputError(
+                f"spring {i + 1}: the stress of '{law.kind}' depends on the strain rate (viscous), "
+                "so each of its ends needs a mass, a prescribed motion or the base"
+            )
 
 
 def plan(
@@ -396,6 +407,8 @@ def plan(
     arrays, count, laws = chain.arrays, len(chain.springs), _laws(chain.laws)
     masses, heavy = np.array([*arrays.inside, above / chain.area]), len(arrays.ends) > 1
     alone = top == scenes.MOTION and count == 1
+    if laws.flowing:
+        _check_viscous(laws, arrays.ends, top)
     internal = laws.flowing and not (alone and laws.made[0].flows < FLOWS)
     damped = dashpots or arrays.damped or top == scenes.VISCOUS or internal
     if heavy or above > 0.0:

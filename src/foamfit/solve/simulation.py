@@ -92,7 +92,8 @@ def _verified(
     groups = len(scene.ends)
     inside = groups > 2
     if groups == 2:  # the base stress depends on the velocity of the mass above
-        inside = bool((rows[: scene.ends[0], 0] > 0.0).any())
+        viscous = any(one.viscous for one in scene.laws.made[: scene.ends[0]])
+        inside = viscous or bool((rows[: scene.ends[0], 0] > 0.0).any())
     long = inside or motion.method == plans.RADAU or _is_long(scene, motion, FEW_STEPS)
     if scene.speed > 0.0 and not long and not _hard(scene, arrays):
         return motion

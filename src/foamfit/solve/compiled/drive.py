@@ -46,7 +46,7 @@ def _begin_ramp(c, want):
         kept = past(aside, i * (1 + terms))
         kept[0], s.gain = s.eta, 1.0
         if s.eta > 0.0:
-            s.eta = s.loss = 0.0 if c.top == MOTION else math.inf
+            s.eta = 0.0 if c.top == MOTION else math.inf
             n.fixed = int(c.top == MOTION and n.eps_at >= 0)
         for k in range(terms):
             kept[1 + k], s.g[k] = s.g[k], 0.0
@@ -74,7 +74,7 @@ def _end_ramp(c, want):
         sum_gain(c, i)
         if kept[0] == 0.0:
             continue
-        s.eta = s.loss = kept[0]
+        s.eta = kept[0]
         if n.eps_at >= 0 and c.top == MOTION:
             y[n.eps_at] = s.eps
             for j in range(p):

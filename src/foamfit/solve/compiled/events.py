@@ -12,11 +12,10 @@ from foamfit.springs.compiled.contract import OF_HELD, OF_PARAMETER, OF_STRESS, 
 from foamfit.springs.laws.record import OWN_ETA
 
 ROUNDED = 1e-12  # strain past an end that rounding explains, of a spring that moves away from it
-AT_ONCE = 1e-9  # share of a step within which an event is at its start
 RISEN = 1e-9  # base stress over the largest stress above which its return to zero ends the contact
 MIDDLE = 0.6  # share of a step at which s.midway is the strain rate; 0.58 of an implicit step
 DIP = 0.3  # least strain rate within a step, over its variation, below which the rate may vanish
-NOWHERE = 2.0  # instead of a share of a step
+DIPS = 16  # pieces of a step in which it is searched for such a rate
 # Kinds of events: a branch ends at its upper or lower strain, a spring turns, contact ends. Then a
 # greatest and a least strain.
 TOP_END, LOW_END, TURN, RELEASE, TOP_TURN, LOW_TURN = range(6)
@@ -30,7 +29,7 @@ def enter_branch(c, i, up, y):
     The derivatives of its held numbers change as well.
     """
     s, n, p = spring(c, i), numbers(c, i), c.p
-    directions, slope = c.directions, s.slope
+    slope = s.slope
     changes = past(s.by, n.parameters)  # no derivatives of a BY_STRESS law
     if n.internal:
         call_inside(c, JUMP, i, up, y, y, y, y)
@@ -43,11 +42,11 @@ def enter_branch(c, i, up, y):
     held, change = past(c.held, 2 * i * p), OF_PARAMETER + n.parameters
     for j in range(p):
         d_sigma = slope * c.strain[i * p + j] + c.part[i * p + j]
-        first, second, own = held[j], held[p + j], directions[2 * j + 1]
+        first, second, own = held[j], held[p + j], c.owned[i * p + j]
         for h in range(2):
             by = past(changes, h * change)
             value = by[OF_STRESS] * d_sigma + by[OF_HELD] * first + by[OF_HELD + 1] * second
-            if directions[2 * j] == i and 0 <= own < OWN_ETA:
+            if 0 <= own < OWN_ETA:
                 value += by[OF_PARAMETER + own]
             held[h * p + j] = value
 
@@ -105,40 +104,18 @@ def _root(c, low, high, i, kind):
 
 
 @inner
-def _locate(c, low, high, i, kind):
-    """Return where an excess becomes positive between two shares.
-
-    A spring that begins at an end of its branch may be past it by rounding and yet move away from
-    it. Then the event is where it returns.
-    """
-    there = _root(c, low, high, i, kind)
-    if kind >= TURN or there - low > AT_ONCE * (high - low):
-        return there
-    part = AT_ONCE * (high - low)
-    while part < 0.5 * (high - low):
-        part *= 4.0
-        look(c, low + part)
-        value = _excess(c, i, kind)
-        if value < -ROUNDED:
-            return _root(c, low + part, high, i, kind)
-        if value > ROUNDED:
-            break
-    return there
-
-
-@inner
 def _earliest(c, before, share):
     """Return the first of the events in (before, share] whose effect is seen at the end."""
     found, who, what = share, -1 + c.none, -1 + c.none
     look(c, found)
     if c.now.pressed > 0.0 and c.carried[0] <= 0.0:
         who, what = c.none, RELEASE + c.none
-        found = _locate(c, before, found, who, what)
+        found = _root(c, before, found, who, what)
         look(c, found)
     for i in range(c.count):
         for kind in range(RELEASE):
             if found > before and _happened(c, i, kind):
-                there = _locate(c, before, found, i, kind)
+                there = _root(c, before, found, i, kind)
                 if who < 0 or there < found:
                     found, who, what = there, i, kind
                 look(c, found)
@@ -155,32 +132,24 @@ def first_event(c):
     A spring may go past the end of its branch and return within the step, or turn twice. So the
     strains are also judged at their extrema, and the rates at their least.
     """
-    nobody, before, pieces, dip, piece = -1 + c.none, 0.0, 1, NOWHERE, 1
+    nobody, before, pieces = -1 + c.none, 0.0, 1
     look(c, 1.0)
     for i in range(c.count):
         s = spring(c, i)
         if s.old_rate * s.rate <= 0.0:
-            pieces = 4
-        there = _may_dip(s)
-        if there < 1.0:
-            dip = min(dip, _turned(c, i, there))
-            look(c, 1.0)
-    while before < 1.0:
-        share, known = piece / pieces, True
-        if before < dip < share:
-            share = dip
-        else:
-            piece += 1
+            pieces = max(pieces, 4)
+        if _may_dip(s):
+            pieces = DIPS
+    for piece in range(1, pieces + 1):
+        share = piece / pieces
         found, who, what = _earliest(c, before, share)
         if who >= 0:
             return found, who, what
         for i in range(c.count):
             s = spring(c, i)
-            if not known:
-                look(c, share)
-            known = not _may_pass(s, (share - before) * c.now.step)
-            if not known:
-                turn = _locate(c, before, share, i, TOP_TURN if s.rate < 0.0 else LOW_TURN)
+            look(c, share)
+            if _may_pass(s, (share - before) * c.now.step):
+                turn = _root(c, before, share, i, TOP_TURN if s.rate < 0.0 else LOW_TURN)
                 found, who, what = _earliest(c, before, turn)
                 if who >= 0:
                     return found, who, what
@@ -202,55 +171,20 @@ def _may_pass(s, dt):
 
 
 @inner
-def _vertex(low, f_low, middle, f_middle, high, f_high):
-    """Return where the parabola through three points is least, and its value there."""
-    first = (f_middle - f_low) / (middle - low)
-    bend = ((f_high - f_middle) / (high - middle) - first) / (high - low)
-    if not bend > 0.0:
-        return NOWHERE, 0.0
-    x = 0.5 * (low + middle - first / bend)
-    return x, f_low + (first + bend * (x - middle)) * (x - low)
-
-
-@inner
 def _may_dip(s):
-    """Return the share of a step at which a spring may move against its branch; else NOWHERE.
+    """Whether a spring may move against its branch within a step.
 
-    Its rate has the sign of the branch at both ends of the step.
+    Its rate has the sign of the branch at both ends of the step; the parabola through these and the
+    rate at MIDDLE has its least value there.
     """
-    start, end = s.turns * s.old_rate, s.turns * s.rate
-    if not (start > 0.0 and end > 0.0):
-        return NOWHERE
-    x, least = _vertex(0.0, start, MIDDLE, s.turns * s.midway, 1.0, end)
-    return x if 0.0 < x < 1.0 and least < DIP * (max(start, end) - least) else NOWHERE
-
-
-@inner
-def _turned(c, i, x):
-    """Return a share of the step at which a spring moves against its branch, from a guess x."""
-    s, low, high = spring(c, i), 0.0, 1.0
-    way = s.turns
-    f_low, f_high, middle, least = way * s.old_rate, way * s.rate, NOWHERE, 0.0
-    for _ in range(8):
-        look(c, x)
-        value = way * s.rate
-        if value < 0.0:
-            return x
-        if middle == NOWHERE:
-            middle, least = x, value
-        elif (value < least) == (x < middle):
-            if value < least:
-                high, f_high, middle, least = middle, least, x, value
-            else:
-                high, f_high = x, value
-        elif value < least:
-            low, f_low, middle, least = middle, least, x, value
-        else:
-            low, f_low = x, value
-        x, _ = _vertex(low, f_low, middle, least, high, f_high)
-        if not low < x < high or abs(x - middle) < 1e-3:
-            break
-    return NOWHERE
+    start, middle, end = s.turns * s.old_rate, s.turns * s.midway, s.turns * s.rate
+    first = (middle - start) / MIDDLE
+    bend = (end - middle) / (1.0 - MIDDLE) - first
+    if not (start > 0.0 and end > 0.0 and bend > 0.0):
+        return False
+    x = 0.5 * (MIDDLE - first / bend)
+    least = start + (first + bend * (x - MIDDLE)) * x
+    return 0.0 < x < 1.0 and least < DIP * (max(start, end) - least)
 
 
 @inner
@@ -270,7 +204,7 @@ def suspicious(c, dt):
         s = spring(c, i)
         if s.eps > s.high or s.eps < s.low or s.turns * s.rate < 0.0:
             return True
-        if _may_pass(s, dt) or (s.turns != 0.0 and _may_dip(s) < 1.0):
+        if _may_pass(s, dt) or (s.turns != 0.0 and _may_dip(s)):
             return True
     return False
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 from foamfit.solve.compiled import motion
-from foamfit.solve.compiled.run import call_inside, grouping, numbers, spring
+from foamfit.solve.compiled.run import grouping, numbers, spring
 from foamfit.solve.compiled.static import elongation_at, root
 from foamfit.solve.scene import STRESS, VISCOUS
 from foamfit.springs.compiled.contract import inner, past
@@ -28,7 +28,7 @@ def _follow(c, g, y, f, want, at):
     reach, rate = motion.span_of(c, g, y, at)
     last = g == c.groups - 1
     push = c.drive.value + c.drive.value_rate * at
-    weight, total, pull, loose, flat, lossy = 0.0, rate, -rate, -1, -1, False
+    weight, total, pull, loose, flat = 0.0, rate, -rate, -1, -1
     if c.solved:
         solve_loose(c, g, i0, i1, reach, push, y)
     for i in range(i0, i1):
@@ -39,7 +39,6 @@ def _follow(c, g, y, f, want, at):
             weight += h / eta
             total += h / eta * stress
             pull += h / eta * (push - stress)
-            lossy = lossy or s.lossy * c.drive.pace > 0.0
         else:
             loose = i
             if s.tangent == 0.0:
@@ -48,23 +47,17 @@ def _follow(c, g, y, f, want, at):
         common = push
     elif loose >= 0:
         common = spring(c, loose if flat < 0 else flat).total
-    elif lossy:
-        c.drive.push, c.drive.spread = push, rate
-        call_inside(c, motion.SHARE, g, want, y, f, y, y)
-        common = c.carried[g]
     elif last and c.top == VISCOUS:  # without the difference of S and push, which may be tiny
         common = push - c.drive.dragged * pull / (c.drive.dragged * weight + 1.0)
     else:
         common = total / weight
     if last and c.top == VISCOUS:
         drag = c.drive.dragged
-        if loose >= 0:
-            c.drive.top_speed = (push - common) / drag
-        elif not lossy:
-            c.drive.top_speed = pull / (drag * weight + 1.0)
+        alone = pull / (drag * weight + 1.0)
+        c.drive.top_speed = alone if loose < 0 else (push - common) / drag
         rate += c.drive.top_speed
     c.carried[g] = common
-    share_rate(c, g, i0, i1, rate, loose, flat, last and c.top == STRESS, lossy)
+    share_rate(c, g, i0, i1, rate, loose, flat, last and c.top == STRESS)
     for i in range(i0, i1):
         s = spring(c, i)
         if s.eta > 0.0 or not c.solved:
@@ -113,26 +106,20 @@ def _close(c, i0, i1, rest):
     least, where = math.inf, i0
     for i in range(i0, i1):
         s = spring(c, i)
-        if s.loss < least * s.height:
-            least, where = s.loss / s.height, i
+        if s.eta < least * s.height:
+            least, where = s.eta / s.height, i
     s = spring(c, where)
     s.rate += rest / s.height
 
 
 @inner
-def share_rate(c, g, i0, i1, rate, loose, flat, pushed, lossy):
-    """Fill the strain rates of a group of several springs; `pushed`: its stress is prescribed.
-
-    `lossy`: a stress of its springs depends on the strain rate, besides that of dashpots.
-    """
+def share_rate(c, g, i0, i1, rate, loose, flat, pushed):
+    """Fill the strain rates of a group of several springs; `pushed`: its stress is prescribed."""
     soft, rest, climb, common = 0.0, rate, c.drive.value_rate, c.carried[g]
     for i in range(i0, i1):
         s = spring(c, i)
         if s.eta > 0.0:
-            if lossy and s.lossy > 0.0:
-                call_inside(c, motion.LOSE, i, g, c.y, c.f, c.y, c.y)
-            else:
-                s.rate = (common - s.total) / s.eta
+            s.rate = (common - s.total) / s.eta
             rest -= s.height * s.rate
         elif flat < 0:
             compliance = s.height / (s.gain * s.tangent)
@@ -176,7 +163,7 @@ def derive_group(c, g, y, f):
     for i in range(i0, i1):
         s = spring(c, i)
         if s.eta > 0.0:
-            weight += s.height / s.loss
+            weight += s.height / s.eta
             continue
         loose = i
         if s.tangent == 0.0:
@@ -188,11 +175,9 @@ def derive_group(c, g, y, f):
         s, own, total = spring(c, i), past(c.own, 2 * i * p), past(c.part, (c.count + i) * p)
         slope, at, share = s.gain * s.steep, numbers(c, i).eps_at, 0.0
         if s.eta > 0.0:
-            share = s.height / s.loss
+            share = s.height / s.eta
             for j in range(p):
                 total[j] += slope * y[c.base + at * p + j]
-            if s.lossy > 0.0:
-                call_inside(c, motion.LOSSES, i, c.none, y, f, y, total)
         else:
             for j in range(p):
                 total[j] += c.drive.pace * own[p + j] * s.rate
@@ -249,7 +234,7 @@ def derive_share(c, i, y, f, is_flat, reach, out):
     if s.eta > 0.0:
         for j in range(p):
             strain[j] = y[mine + j]
-            f[mine + j] = (out[j] - total[j] - s.rate * own[p + j]) / s.loss
+            f[mine + j] = (out[j] - total[j] - s.rate * own[p + j]) / s.eta
     elif is_flat:
         for j in range(p):
             strain[j] = reach[j] / s.height

@@ -256,15 +256,6 @@ def _solve(c, h, at, tol, first, last):
 
 
 @inner
-def _is_lossy(c, g):
-    """Whether a stress in a group depends on the strain rate, besides that of dashpots."""
-    lossy = False
-    for i in range(c.first[g], c.first[min(g + 1, c.groups)]):
-        lossy = lossy or spring(c, i).lossy > 0.0
-    return lossy
-
-
-@inner
 def _size(c, k, old, new):
     """Return the size to which the error of a component is relative.
 
@@ -276,8 +267,9 @@ def _size(c, k, old, new):
     if k >= 2 * c.nodes or k % 2 == 0:
         return max(_scale(c, k), size)
     g = k // 2
-    if _is_lossy(c, g) or _is_lossy(c, g + 1):
-        return max(_scale(c, k), size)
+    for i in range(c.first[g], c.first[min(g + 2, c.groups)]):
+        if spring(c, i).lossy > 0.0:
+            return max(_scale(c, k), size)
     damping = stiffness_of(c, g, True) + stiffness_of(c, g + 1, True)
     if c.drive.overdamped > 0.0:
         return max(c.drive.beginning, abs(c.carried[0])) / damping
@@ -338,16 +330,16 @@ def _guess(c, h, last):
 
 
 @inner
-def _allowed(c, h, excess, tol, rounded):
+def _allowed(c, h, excess, tol):
     """Return the length to use for a step with this error over the tolerance: h to accept it.
 
-    An excessive error is accepted if rounding dominates it or if no shorter step is resolved.
+    An excessive error is accepted if no shorter step is resolved.
     """
     r = c.now
     if not excess < math.inf:
         return 0.3 * h
     factor, floor = 0.9 * max(excess, 1e-12) ** (-1.0 / 6.0), max(r.floor, 1e-15 * abs(r.now))
-    if excess > 1.0 and not rounded and h > floor * (1.0 + 1e-9):
+    if excess > 1.0 and h > floor * (1.0 + 1e-9):
         return max(h * min(max(factor, 0.1), 0.9), floor)
     if excess <= 1.0:
         r.damping = 0.0
@@ -374,7 +366,6 @@ def step(c, want, tol, upto, most):
     """Take one implicit step, shorter ones until it is accurate; return how it ended."""
     r, at = c.now, c.now.now
     linearise(c, at)
-    first, first_error = r.step, math.inf
     while True:
         h = r.step
         if r.now + h == r.now or not h > 0.0 or r.taken >= most:
@@ -386,10 +377,7 @@ def step(c, want, tol, upto, most):
             r.step, r.before = 0.3 * h, 0.0
             continue
         excess = _error(c, h, tol)
-        if first_error == math.inf:
-            first, first_error = h, excess
-        rounded = h <= 1e-6 * first and excess > 0.3 * first_error
-        allowed = _allowed(c, h, excess, tol, rounded)
+        allowed = _allowed(c, h, excess, tol)
         if allowed < h:
             r.step = allowed
             continue

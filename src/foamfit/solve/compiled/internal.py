@@ -5,26 +5,18 @@ derivatives, see `compiled.contract`.
 
 The derivatives δx of internal variables need those of the strain rate. Where no state contains the
 strain these are unknown, and u = δx - A δε is integrated instead, the derivatives at fixed strain:
-du/dt = dε/dt (A_x u + A_p) + δB - A_x B δε.
-
-In a group of several springs the strain rate of one with a stress V solves T + V + η dε/dt = S.
+du/dt = dε/dt (A_x u + A_p) + δB - A_x B δε. A spring with a stress V is the only one between two
+nodes.
 """
 
 from __future__ import annotations
 
-import math
-
 from foamfit.solve.compiled import motion
 from foamfit.solve.compiled.motion import evaluate
 from foamfit.solve.compiled.run import numbers, spring, working
-from foamfit.solve.scene import VISCOUS
 from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import ALONG_A, ALONG_B, BY_RATE, inner, past
 from foamfit.springs.laws.record import OWN_ETA
-
-LEAST_RATE = 1e-25  # smaller strain rates are zero, 1/s
-MOST_RATE = 1e30  # larger ones mean that V vanishes, so that no stress determines the rate
-ENOUGH = 2e-15  # relative change of a rate or stress that ends Newton's method
 
 
 @contract.inlined
@@ -50,21 +42,16 @@ def _path(c, i):
     s.drift = c.drive.pace * s.gain * values[ALONG_B * size]
 
 
-# ---------------------------------------------------------------- derivatives
-
-
 @inner
 def _part(c, i, y, part):
     """Fill the derivatives at fixed strain, by direction, and those of the stress."""
     n, p, x = numbers(c, i), c.p, numbers(c, i).internals
-    if spring(c, i).lossy > 0.0:  # at the strain rate found since
-        evaluate(c, i, contract.PATHS if n.fixed else 1)
     for j in range(p):
         out = toward(c, i, j)
-        change, own = past(out, 2 + 2 * x), c.directions[2 * j + 1]
+        change, own = past(out, 2 + 2 * x), c.owned[i * p + j]
         for k in range(x):
             change[k] = y[c.base + (n.x_at + k) * p + j]
-        direct(c, i, change, own if c.directions[2 * j] == i and 0 <= own < OWN_ETA else -1, out)
+        direct(c, i, change, own if own < OWN_ETA else -1, out)
         part[j] = out[0]
 
 
@@ -123,7 +110,7 @@ def _jump(c, i, up, y):
     delays = past(c.common, (c.groups + 1) * p)
     for j in range(p):
         strain, late = c.strain[i * p + j], 0.0
-        own = c.directions[2 * j + 1] if c.directions[2 * j] == i else OWN_ETA
+        own = c.owned[i * p + j]
         for k in range(x + 1):  # of the end, then of the internal variables at the instant
             by = end if k == 0 else past(changes, (k - 1) * wide)
             value = by[0] * (strain + s.rate * late if k > 0 else strain)
@@ -132,7 +119,7 @@ def _jump(c, i, up, y):
                 if k > 0:
                     d_x += (s.rate * first[m] + pace * first[x + m]) * late
                 value += by[1 + m] * d_x
-            if own < OWN_ETA:
+            if 0 <= own < OWN_ETA:
                 value += by[1 + x + own]
             if k == 0:
                 late = (value - strain) / faster if faster != 0.0 else 0.0
@@ -149,102 +136,9 @@ def _jump(c, i, up, y):
             y[c.base + (n.x_at + k) * p + j] -= moved
 
 
-# ---------------------------------------------------------------- the stress V in a group
-
-
-@inner
-def _lose(c, i, common):
-    """Fill the strain rate of a damped spring under the stress of its group.
-
-    Newton's method in logarithms inside a bracket: it takes one step for a power of the rate.
-    """
-    s, n = spring(c, i), numbers(c, i)
-    force, s.loss = common - s.total, s.eta
-    if s.lossy == 0.0:
-        s.rate = force / s.eta
-        return
-    sign, rate, low, high = 1.0 if force > 0.0 else -1.0, abs(s.rate), 0.0, math.inf
-    values = spring(c, i).by
-    rate = rate if rate > 0.0 else 1.0
-    for _ in range(200):
-        s.rate = sign * rate if force != 0.0 else 0.0
-        evaluate(c, i, 1 + c.none)
-        value = sign * (values[1] + s.eta * s.rate)
-        s.loss = s.eta + values[BY_RATE * (2 + 2 * n.internals)]
-        if force == 0.0:  # at rest, where the derivative of a power is infinite or zero
-            s.loss = math.inf
-            return
-        low, high = (low, rate) if value >= abs(force) else (rate, high)
-        new = -1.0
-        if value > 0.0 and s.loss > 0.0:
-            new = rate * (abs(force) / value) ** (value / (s.loss * rate))
-        if abs(new - rate) <= ENOUGH * rate:
-            return
-        if not low < new < high:
-            new = math.sqrt(low * high) if low > 0.0 else 1e-3 * high
-            if high == math.inf:
-                new = 1e3 * low
-        if new in (low, high):
-            return
-        rate = new
-        if rate > MOST_RATE:
-            s.rate = s.loss = math.nan
-            return
-        if not rate > LEAST_RATE:
-            force = 0.0
-
-
-@inner
-def _share(c, g):
-    """Fill the stress and the rates of damped springs that reach the rate of their group together.
-
-    Of a viscous top the velocity is the unknown, as the stresses on both sides of its damper may
-    hardly differ.
-    """
-    i0, i1 = c.first[g], c.first[g + 1]
-    push, rate, low, high = c.drive.push, c.drive.spread, -math.inf, math.inf
-    drag = c.drive.dragged if g == c.groups - 1 and c.top == VISCOUS else 0.0
-    now = c.carried[g] if drag == 0.0 else -c.drive.top_speed
-    now = now if abs(now) < math.inf else 0.0
-    for _ in range(200):
-        common = now if drag == 0.0 else push + drag * now
-        miss, soft = -rate, 0.0
-        for i in range(i0, i1):
-            s = spring(c, i)
-            _lose(c, i, common)
-            miss += s.height * s.rate
-            soft += s.height / s.loss
-        if drag > 0.0:
-            miss, soft = miss + now, soft * drag + 1.0
-        low, high = (low, now) if miss > 0.0 else (now, high)
-        new = now - miss / soft if soft > 0.0 else math.nan
-        if miss == 0.0 or abs(new - now) <= ENOUGH * abs(now):
-            break
-        if not low < new < high:
-            if low > -math.inf and high < math.inf:
-                new = 0.5 * (low + high)
-            else:
-                new = now + (1.0 if miss < 0.0 else -1.0) * max(abs(now), 1.0)
-            if new in (low, high):
-                break
-        now = new
-    c.carried[g] = common
-    if drag > 0.0:
-        c.drive.top_speed = -now
-
-
-@inner
-def _losses(c, i, y, out):
-    """Add the derivatives of V of a spring in a group, at the strain rate that it has found."""
-    p, at = c.p, numbers(c, i).eps_at
-    for j in range(p):
-        c.strain[i * p + j] = y[c.base + at * p + j]
-    _friction(c, i, past(c.common, c.groups * p), out)
-
-
 @working
 def inside_task(c, task, i, up, y, f, quicker, out):
-    """Do one task, for a spring or a group."""
+    """Do one task for a spring."""
     if task == motion.PART:
         _part(c, i, y, out)
     elif task == motion.FLOW:
@@ -253,11 +147,5 @@ def inside_task(c, task, i, up, y, f, quicker, out):
         _friction(c, i, quicker, out)
     elif task == motion.PATH:
         _path(c, i)
-    elif task == motion.LOSE:
-        _lose(c, i, c.carried[up])
-    elif task == motion.SHARE:
-        _share(c, i)
-    elif task == motion.LOSSES:
-        _losses(c, i, y, out)
     else:
         _jump(c, i, up, y)

@@ -13,14 +13,11 @@ from foamfit.springs.compiled.contract import inner, outer, past, start
 from foamfit.springs.laws.record import BEGUN, STRUCK
 
 # Numbers that a run is given, after onsite damping and pace: velocity of a striker, tolerance,
-# bound on steps, length of a short implicit step, whether the contact is overdamped, whether
-# implicit steps follow if there are too many, least scales of displacement, velocity, strain,
-# stress.
-SPEED, TOL, MOST, BRIEFLY, OVER, FOLLOWED, LEAST = range(2, 9)
+# bound on steps, length of a short implicit step, whether the contact is overdamped, least scales
+# of displacement, velocity, strain, stress.
+SPEED, TOL, MOST, BRIEFLY, OVER, LEAST = range(2, 8)
 FIRST = 40.0  # first implicit step over a short one
 FADES = 5.0  # longest explicit step over a relaxation time; steps are stable up to 6.3
-TRIED, BEYOND = 500, 4.0  # steps, and expected steps over their bound, that end a hopeless run
-STOPPED = 0.1  # most of the velocity that a first step takes
 LEAST_SHARE = 1e-6  # of the largest scale of nodes, see `_fresh_scales`
 SWITCHED, RELEASED, STALLED = 1, 2, 3  # what happened in a step
 
@@ -263,21 +260,13 @@ def advance(c, how, struck, want):
 
 
 @inner
-def _is_hopeless(c, most):
-    """Whether a run along a drive would take far too many steps, by those so far."""
-    r, t, last = c.now, c.time, c.samples - 1
-    share = (r.begun + r.now - t[0]) / (t[last] - t[0])
-    return r.taken > TRIED and r.taken > BEYOND * most * share
-
-
-@inner
-def _failure(c, how, most, gives_up):
+def _failure(c, how, most):
     """Return how a run ends after a step: DONE if it goes on."""
     if c.drive.flat > 0.0:
         return c.none + scene.FLAT_UNDER_STRESS
     if how == events.FAILED and not abs(c.new[0]) < math.inf:
         return c.none + scene.NOT_FINITE
-    if c.now.taken >= most or (gives_up and _is_hopeless(c, most)):
+    if c.now.taken >= most:
         return c.none + scene.TOO_MANY_STEPS
     return c.none + (scene.STEP_UNDERFLOW if how == events.FAILED else scene.DONE)
 
@@ -299,21 +288,17 @@ def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log):
         _strike(c, want)
         short = FIRST * r.brief
         r.step = min(r.horizon, short if c.degree and short > 0.0 else _first_step(c, tol))
-        if c.inside_at:  # a stress that depends on the rate may stop the striker at once
-            top = 2 * c.groups - 1
-            r.step = min(r.step, STOPPED * abs(c.y[top] / c.stage[top]))
     else:
         done = run.call_drive(c, 1, want)
         r.step = r.horizon
     outcome, ended = scene.DONE, math.nan
-    gives_up = given[FOLLOWED] > 0.0 and not struck
     while not (done or (struck and int(r.sample) == c.samples)):
         _fresh_scales(c)
         events.keep_values(c)
         r.step = min(r.step, r.horizon - r.now, longest)
         upto = c.time[int(r.sample)] if struck else math.inf
         how = run.call_step(c, want, tol, upto, most)
-        outcome = _failure(c, how, most, gives_up)
+        outcome = _failure(c, how, most)
         event = run.call_advance(c, how, struck, want) if outcome == scene.DONE else c.none
         stalled = stalled + 1 if event == STALLED else 0
         if stalled > 4 * c.count + 8:

@@ -15,10 +15,10 @@ from foamfit.solve.compiled.run import call_inside, numbers, spring
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import inlined, inner, past
-from foamfit.springs.laws.record import HEAVIER, MOVED, OWN_RELAXATION
+from foamfit.springs.laws.record import HEAVIER, MOVED, OWN_ETA, OWN_RELAXATION
 
 # Tasks of `internal`.
-PART, FLOW, FRICTION, JUMP, PATH, LOSE, SHARE, LOSSES = range(8)
+PART, FLOW, FRICTION, JUMP, PATH = range(5)
 ALL, IN_STEP = -1, -2  # instead of a group
 ONLY_DERIVATIVES = 2  # instead of 0 or 1 for `want`, where the values are known
 
@@ -77,7 +77,7 @@ def derive_spring(c, i, y):
     """Fill the derivatives of the stress of a spring at fixed strain, and of T at fixed strain."""
     s, n, p = spring(c, i), numbers(c, i), c.p
     part, total = past(c.part, i * p), past(c.part, (c.count + i) * p)
-    owned, directions = c.owned, c.directions
+    owned = past(c.owned, i * p)
     s.steep = s.tangent if n.fixed else s.slope
     for j in range(p):
         part[j] = 0.0
@@ -88,8 +88,9 @@ def derive_spring(c, i, y):
     if n.internal:
         call_inside(c, PART, i, c.none, y, y, y, part)
     else:
-        for k in range(owned[i], owned[i + 1]):
-            part[owned[k]] += s.by[directions[2 * owned[k] + 1]]
+        for j in range(p):
+            if 0 <= owned[j] < OWN_ETA:
+                part[j] += s.by[owned[j]]
     gain = s.gain
     for j in range(p):
         total[j] = gain * part[j]
@@ -97,7 +98,7 @@ def derive_spring(c, i, y):
         g, dz, of_g = s.g[k], past(y, c.base + (n.z_at + k) * p), OWN_RELAXATION + 2 * k
         for j in range(p):
             total[j] += g * dz[j]
-            if directions[2 * j] == i and directions[2 * j + 1] == of_g:
+            if owned[j] == of_g:
                 total[j] += c.drive.pace * (s.sigma + y[n.z_at + k])
 
 
@@ -109,13 +110,13 @@ def derive_inside(c, i, y, f, quicker):
     """
     s, n, p = spring(c, i), numbers(c, i), c.p
     part, strain = past(c.part, i * p), past(c.strain, i * p)
-    directions, slope = c.directions, s.steep
+    owned, slope = past(c.owned, i * p), s.steep
     for k in range(c.terms):
         at, per = c.base + (n.z_at + k) * p, 1.0 / s.tau[k]
         more, of_tau = (y[n.z_at + k] + s.sigma) * per * per, OWN_RELAXATION + 2 * k + 1
         for j in range(p):
             f[at + j] = -per * (y[at + j] + slope * strain[j] + part[j])
-            if directions[2 * j] == i and directions[2 * j + 1] == of_tau:
+            if owned[j] == of_tau:
                 f[at + j] += more
     if n.internal:
         call_inside(c, FLOW, i, c.none, y, f, quicker, f)

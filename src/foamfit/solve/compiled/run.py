@@ -42,9 +42,9 @@ FLOATS = (
     "jacobian", "alive", "largest", "kept", "systems", "right",
 )  # fmt: skip
 # Arrays of integers: rows of NUMBERS of the springs; first spring of each group, and their number;
-# directions of the derivatives, (p, 2); where the directions of each spring begin and end, and
-# these directions; kinds of the components. Those of implicit steps: pivots, SYSTEMS of n; places
-# of the components in the systems, and their groups.
+# directions of the derivatives, (p, 2); of each spring and direction its second number if the first
+# is that of the spring, else -1; kinds of the components. Those of implicit steps: pivots, SYSTEMS
+# of n; places of the components in the systems, and their groups.
 INTEGERS = ("numbers", "first", "directions", "owned", "kinds", "pivots", "places", "groups_of")
 GIVEN = ("time", "values", "out", "log")  # arrays of the caller
 ADDRESSES = (
@@ -85,12 +85,11 @@ OF_W, OF_V, OF_EPS, OF_SIGMA, SCALES = range(5)
 # viscous top; 1 if a stress acts on a flat branch; onsite damping of the top, Pa s/m; 0 if time
 # stands still for the laws, else 1; acceleration of the striker by gravity; 1 if dashpots stop a
 # striker long before the springs, see `rates.is_overdamped`; base stress at the start of an
-# implicit step; stress on the top, and rate of the elongation of the group whose stress `internal`
-# solves for; derivative of the prescribed motion by its shift at the start of the piece, its rate,
-# and its present value.
+# implicit step; derivative of the prescribed motion by its shift at the start of the piece, its
+# rate, and its present value.
 DRIVE = (
     "value", "value_rate", "top_speed", "flat", "dragged", "pace", "gravity", "overdamped",
-    "beginning", "push", "spread", "shift", "shift_rate", "shifted",
+    "beginning", "shift", "shift_rate", "shifted",
 )  # fmt: skip
 # Numbers that change during a run. First those that it returns: outcome, time of its end, steps,
 # switches, whether all samples are finite, largest stress and displacement; of implicit steps, size
@@ -146,7 +145,7 @@ def _pointed(field: str, returns: Any, *takes: Any) -> tuple[Callable[..., contr
 computing, call_rates = _pointed("rates_at", types.void, REALS_AT, REALS_AT, WHOLE, REAL, WHOLE)
 # group, state, rates, whether with derivatives, time since the piece began; returns S
 grouping, call_group = _pointed("group_at", REAL, WHOLE, REALS_AT, REALS_AT, WHOLE, REAL)
-# task (see `internal`), spring or group, up or whether with derivatives, state, rates, derivatives
+# task (see `internal`), spring, up or whether with derivatives, state, rates, derivatives
 # of the strain rate, results
 working, call_inside = _pointed(
     "inside_at", types.void, WHOLE, WHOLE, WHOLE, REALS_AT, REALS_AT, REALS_AT, REALS_AT
@@ -208,7 +207,7 @@ def begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals):
     for i in range(c.count):
         s, n, height = spring(c, i), numbers(c, i), tall[i]
         s.height, s.per_height = height, 1.0 / height
-        s.eta, s.loss = given[0], given[0]
+        s.eta = given[0]
         for k in range(c.terms):
             s.g[k], s.tau[k] = given[1 + 2 * k], given[2 + 2 * k]
         sum_gain(c, i)

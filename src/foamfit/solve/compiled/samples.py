@@ -160,13 +160,13 @@ def _write_slope(c, j, at, n):
     found = past(shares, 6 * BATCH)
     slope, sigma = past(found, contract.SLOPE * n), past(found, contract.OF_LAW * n)
     stress, motion = past(row_of(c, 1 + j, c.none), at), past(row_of(c, 1 + j, c.none + 1), at)
-    per, eta, gain, what = s.per_height, s.eta, s.gain, c.directions[2 * j + 1]
-    mine, of_height, of_eta = c.directions[2 * j] == 0, c.own[j], c.own[p + j]
+    per, eta, gain, what = s.per_height, s.eta, s.gain, c.owned[j]
+    of_height, of_eta = c.own[j], c.own[p + j]
     polynomial(c, c.base + j, n, work)
     for k in range(n):
         motion[k] = work[k]
         stress[k] = gain * slope[k] * per * (work[k] - of_height * eps[k])
-    if mine and 0 <= what < OWN_ETA:
+    if 0 <= what < OWN_ETA:
         by = past(found, (contract.BY + what) * n)
         for k in range(n):
             stress[k] += gain * by[k]
@@ -183,7 +183,7 @@ def _write_slope(c, j, at, n):
         polynomial(c, c.base + (own.z_at + q) * p + j, n, work)
         for k in range(n):
             stress[k] += s.g[q] * work[k]
-        if mine and what == OWN_RELAXATION + 2 * q:
+        if what == OWN_RELAXATION + 2 * q:
             polynomial(c, own.z_at + q, n, work)
             for k in range(n):
                 stress[k] += sigma[k] + work[k]

@@ -167,7 +167,7 @@ def _derive(c, h):
             total = integral(a, first, low, square, 0.0, 0.0)
             change = integral(past(a, 1), first, low, square, 0.0, 0.0) - total
             for j in range(p):
-                if c.directions[2 * j] == i and c.directions[2 * j + 1] == what:
+                if c.owned[i * p + j] == what:
                     after[j] += (math.exp(-x) * c.y[at] + total + x * change) * x / tau
     rates_of(c, c.none, new, c.f, ONLY_DERIVATIVES, c.now.now + h)
     for i in range(c.count):

@@ -48,7 +48,7 @@ def fill_row(made: Compiled, values: Array, terms: Array, room: int, row: Array)
     """
     own, eta = 1 + 2 * room, values.item(-1)
     fine = made.fill(values[:-1], row[own : own + made.columns]) and eta >= 0.0
-    row[0] = made.least_eta if eta == 0.0 else eta
+    row[0] = eta
     if room:
         row[2:own:2] = np.inf  # unused terms
         row[1 : 1 + terms.size] = terms

@@ -66,21 +66,20 @@ OF_LAW, SLOPE, MISS, BY_HELD, BY = 0, 1, 2, 3, 5
 # strain stops rising (falling). Its present values: strain and its rate, stress T with relaxation
 # but without dashpot, the part of dT/dt without dε/dt, strain and rate at the start of a step,
 # height, dashpot, 1 + Σ g, 1/height, dε/dσ, dσ/dε along the path of the internal variables, Σ g z,
-# dσ/dε of the derivatives, dashpot and ∂V by the strain rate, 1 if V depends on that rate, which
-# `begin` sets. Then the first internal variable, the strain rate about the middle of a step, and
-# the first results.
+# dσ/dε of the derivatives, 1 if V depends on the strain rate, which `begin` sets. Then the first
+# internal variable, the strain rate about the middle of a step, and the first results.
 SPRING_FIELDS = (
     ("branch", "low", "high", "sigma_low", "sigma_high", "turns"),
     (
         "eps", "rate", "total", "drift", "old_eps", "old_rate", "height", "eta", "gain",
-        "per_height", "soft", "tangent", "offset", "steep", "loss", "lossy", "x",
+        "per_height", "soft", "tangent", "offset", "steep", "lossy",
     ),
+    ("x",),
     ("midway",),
     ("sigma", "slope", "miss"),
 )  # fmt: skip
-_FIRST = (0, MEMORY, RELAX + 2 * MOST_TERMS, RESULTS)
+_FIRST = (0, MEMORY, X, RELAX + 2 * MOST_TERMS, RESULTS)
 EPS = MEMORY  # where the strain lies
-TINY = 1e-300  # dashpot of a law with V that has none: it counts as damped
 OF_STRESS, OF_HELD, OF_PARAMETER = 0, 1, 3  # columns of the derivatives of `switch`
 EXPLICIT, BY_STRESS, INTERNAL = range(3)
 
@@ -218,7 +217,7 @@ class Compiled(NamedTuple):
     #: columns of the row with slopes dσ/dε (Pa) of branches at zero stress, that at rest first
     slopes: tuple[int, ...] = ()
     pole: int = -1  #: column of the row with ε_*, if the strain stays below 1 + ε_*
-    least_eta: float = 0.0  #: TINY if V depends on the strain rate, Pa·s
+    viscous: bool = False  #: whether V depends on the strain rate
     flows: int = 0  #: how the state changes within a branch: STILL, FADES or FLOWS
 
     @property

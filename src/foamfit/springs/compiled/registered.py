@@ -32,8 +32,8 @@ STEP = 1e-40  # imaginary step
 # on the next branch, whose number it returns.
 VALUES, ENDS, DOWN, UP = range(4)
 # What a spring of a registered law keeps in memory: the address of its function, kind, numbers of
-# parameters and of internal variables, whether its branches end, and whether V depends on the rate.
-FORMULAS, KIND, COUNT, INSIDE, BOUNDED, DAMPS = range(contract.OWN, contract.OWN + 6)
+# parameters and of internal variables, and whether its branches end.
+FORMULAS, KIND, COUNT, INSIDE, BOUNDED = range(contract.OWN, contract.OWN + 5)
 _AT, _LONG = contract.COMPLEXES_AT, contract.WHOLE
 FORMULA = _LONG(_AT, _LONG, _LONG, _AT)
 FURTHEST, TRIALS = 1e12, 200  # largest strain, and trials, in the search for a strain
@@ -113,7 +113,6 @@ def enter(row, s):
 @contract.beginning
 def _begin(row, s):
     s.eps = s.branch = s.rate = 0.0
-    s.lossy = s[DAMPS]
     for k in range(int(s[INSIDE])):
         s.xs[k] = 0.0
     enter(row, s)
@@ -175,7 +174,7 @@ def evaluate_internal(row, s, eps, x, own, want, out):
         values[f], values[size + f] = found[f].real, found[f].imag / STEP
     out[contract.OF_LAW], out[SLOPE] = values[0], values[size]
     point[0] = complex(eps, 0.0)
-    if want and s[DAMPS] > 0.0:
+    if want and s.lossy > 0.0:
         point[1] = complex(s.rate, STEP)
         ask(s, point, VALUES, found)
         values[contract.BY_RATE * size] = found[1].imag / STEP
@@ -363,9 +362,9 @@ def compile_law(law: Law) -> contract.Compiled:
     """Compile a registered law."""
     given: Any = law.functions
     count, inside = len(law.params), law.internal
-    simple = inside == 0 and given.viscous is None
-    kind, bounded = EXPLICIT if simple else INTERNAL, float(given.ends is not None)
-    damps = float(given.viscous is not None)
+    viscous = given.viscous is not None
+    kind, bounded = INTERNAL if inside or viscous else EXPLICIT, float(given.ends is not None)
+    lossy = float(viscous)
     formulas = _formulas(given, count, inside)
     made = formulas.overloads[FORMULA.args]
     where = float(made.library.get_pointer_to_function(made.fndesc.llvm_func_name))  # below 2^53
@@ -375,7 +374,7 @@ def compile_law(law: Law) -> contract.Compiled:
     @cfunc(contract.REAL(contract.REALS_AT, contract.SPRING), **contract.OPTIONS)
     def begin(row, s):
         s[FORMULAS], s[KIND], s[COUNT], s[INSIDE] = where, kind, count, inside
-        s[BOUNDED], s[DAMPS] = bounded, damps
+        s[BOUNDED], s.lossy = bounded, lossy
         contract.call_begin(begin_any, row, s)
         return 0.0
 
@@ -390,7 +389,7 @@ def compile_law(law: Law) -> contract.Compiled:
     if given.along or given.viscous or (given.decay and (given.ends or given.switch)):
         flows = contract.FLOWS
     return contract.Compiled(
-        fill, kind, columns, count, inside, functions, (count,), -1, damps * contract.TINY, flows
+        fill, kind, columns, count, inside, functions, (count,), -1, viscous, flows
     )
 
 
