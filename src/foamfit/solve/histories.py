@@ -12,7 +12,7 @@ from foamfit.arrays import Array
 from foamfit.solve import cache
 from foamfit.solve.compiled import along, loop, static
 from foamfit.solve.compiled.run import ENDED, OUTCOME, SWITCHES
-from foamfit.solve.layout import Shape, lay_out
+from foamfit.solve.layout import Shape, memory_of
 from foamfit.solve.scene import DONE, MOTION, NO_SWITCHES, STRESS
 from foamfit.springs.compiled import compiled
 from foamfit.springs.compiled.contract import FLOWS, INTERNAL
@@ -30,14 +30,14 @@ def _given(law: Law, row: Array, history: Array, top: int, out: Array) -> tuple[
     row, made = row.copy(), compiled(law)
     integrated = made.kind == INTERNAL and (made.flows == FLOWS or top == STRESS)
     row[0] = 0.0  # no dashpot
-    layout = lay_out(Shape((law,), 0, (1,), top, b"\0", b"", False, 0, integrated))
+    memory = memory_of(Shape((law,), 0, (1,), top, b"\0", b"", False, 0, integrated))
     most = float(np.abs(history).max())
     scales = (most, np.abs(np.diff(history)).max(initial=0.0), most, 0.0)
     if top == STRESS:
         scales = 1e-3, 0.0, 1e-3, most
     reals = np.array((0.0, 0.0, 0.0 if integrated else TOL, TOL, 1e9, 0.0, 0.0, *scales))
     time = np.arange(history.size, dtype=float)
-    return [*layout.memory(), row[None, :], _ONE, _ONE, reals, history, time, out], integrated
+    return [*memory, row[None, :], _ONE, _ONE, reals, history, time, out], integrated
 
 
 def stress_along(law: Law, row: Array, strain: Array) -> tuple[Array, NDArray[np.int64]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
 from itertools import pairwise
@@ -20,18 +19,6 @@ from foamfit.springs.compiled.contract import BY_STRESS, FADES, INTERNAL
 from foamfit.springs.laws.record import Law
 
 Memory = tuple[NDArray[np.int64], Array]  # the integers and floats of a run
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Layout:
-    """Where everything of a run lies."""
-
-    words: NDArray[np.int64]  #: integers of a run, with places instead of addresses
-    floats: int  #: number of floats
-
-    def memory(self) -> Memory:
-        """Return the memory of a new run."""
-        return self.words.copy(), np.zeros(self.floats)
 
 
 class Shape(NamedTuple):
@@ -58,64 +45,48 @@ class Shape(NamedTuple):
         return [range(i, j) for i, j in pairwise((0, *self.ends))]
 
 
-def place_state(shape: Shape, numbers: np.recarray, nodes: int) -> tuple[list[int], int]:
-    """Give every component its place; return the kinds, and how many have derivatives."""
-    damped = np.frombuffer(shape.damped, bool)
-    more, count = run.SCALES + len(shape.laws) + 2 * nodes, len(shape.laws)
-    kinds = list(range(more - 2 * nodes, more))
-    several = [False] * count
+def place_state(
+    shape: Shape, numbers: np.recarray, nodes: int
+) -> tuple[list[int], NDArray[np.int64]]:
+    """Give every component its place; return the kinds, and groups of those with derivatives."""
+    damped, count = np.frombuffer(shape.damped, bool), len(shape.laws)
+    more = run.SCALES + count + 2 * nodes
+    kinds, groups_of = list(range(run.SCALES + count, more)), [k // 2 for k in range(2 * nodes)]
     for g, springs in enumerate(shape.groups):
-        alone = len(springs) == 1 and not (
-            g == len(shape.ends) - 1 and shape.top in (STRESS, VISCOUS)
-        )
+        last = g == len(shape.ends) - 1
+        several = len(springs) > 1 or (last and shape.top in (STRESS, VISCOUS))
         for i in springs:
-            several[i] = not alone
-    for i, own in enumerate(numbers):
-        own.eps_at = own.x_at = -1
-        own.fixed = several[i] and not damped[i]
-        if several[i] and damped[i]:
+            own = numbers[i]
+            own.eps_at = own.x_at = -1
+            own.fixed = several and not damped[i]
+            if several and damped[i]:
+                own.eps_at = len(kinds)
+                kinds.append(run.SCALES + i)
+            own.z_at = len(kinds)
+            kinds += [run.OF_SIGMA] * shape.terms
+            if own.internal:
+                own.x_at, inside = len(kinds), int(own.internals)
+                kinds += range(more, more + inside)
+                more += inside
+            groups_of += [g] * (len(kinds) - len(groups_of))
+    for i, own in enumerate(numbers if not shape.solved else ()):
+        if own.fixed:
             own.eps_at = len(kinds)
             kinds.append(run.SCALES + i)
-        own.z_at = len(kinds)
-        kinds += [run.OF_SIGMA] * shape.terms
-        if own.internal:
-            own.x_at, inside = len(kinds), int(own.internals)
-            kinds += range(more, more + inside)
-            more += inside
-    carries = len(kinds)
-    for i, own in enumerate(numbers):
-        if not shape.solved and several[i] and own.eps_at < 0:
-            own.eps_at = len(kinds)
-            kinds.append(run.SCALES + i)
-        if not shape.solved and own.by_stress:
+        if own.by_stress:
             own.x_at = len(kinds)
             kinds.append(run.OF_SIGMA)
-    return kinds, carries
+    return kinds, np.array(groups_of, np.int64)
 
 
-def order(shape: Shape, numbers: np.recarray, nodes: int) -> tuple[list[int], list[int], int]:
-    """Order the components by groups: return place and group of each, and the reach.
+def order(groups_of: NDArray[np.int64], groups: int) -> tuple[NDArray[np.int64], int]:
+    """Order components by groups: return the place of each, and the reach.
 
     Components couple with those of the neighbouring groups: at places closer than the reach.
     """
-    damped = np.frombuffer(shape.damped, bool)
-    found: list[tuple[int, int]] = []  # component and group, in order
-    sizes = [0]
-    for g, springs in enumerate(shape.groups):
-        one = [2 * g, 2 * g + 1] if g < nodes else []
-        for i in springs:
-            own = numbers[i]
-            if own.eps_at >= 0 and damped[i]:
-                one.append(int(own.eps_at))
-            one += range(int(own.z_at), int(own.z_at) + shape.terms)
-            if own.internal:
-                one += range(int(own.x_at), int(own.x_at + own.internals))
-        found += [(k, g) for k in one]
-        sizes.append(len(one))
-    places, groups = [0] * len(found), [0] * len(found)
-    for place, (k, g) in enumerate(found):
-        places[k], groups[k] = place, g
-    return places, groups, max(a + b for a, b in pairwise(sizes)) - 1
+    places = np.argsort(np.argsort(groups_of, kind="stable"))
+    sizes = [0, *np.bincount(groups_of, minlength=groups)]
+    return places, int(max(a + b for a, b in pairwise(sizes))) - 1
 
 
 def _functions(
@@ -145,8 +116,8 @@ def _functions(
 
 
 @lru_cache(maxsize=1024)
-def lay_out(shape: Shape) -> Layout:
-    """Lay out a run."""
+def lay_out(shape: Shape) -> tuple[NDArray[np.int64], int]:
+    """Return the integers of a run, with places instead of addresses, and the number of floats."""
     made = [compiled(law) for law in shape.laws]
     directions = np.frombuffer(shape.directions, np.int64).reshape(-1, 2).tolist()
     count, groups, p = len(made), len(shape.ends), len(directions)
@@ -157,15 +128,15 @@ def lay_out(shape: Shape) -> Layout:
         for one in made
     ]  # fmt: skip
     numbers = np.array(of_springs, [(name, np.int64) for name in run.NUMBERS]).view(np.recarray)
-    kinds, carries = place_state(shape, numbers, nodes)
-    base, internals = len(kinds), sum(one.internal for one in made)
+    kinds, groups_of = place_state(shape, numbers, nodes)
+    carries, base, internals = len(groups_of), len(kinds), sum(one.internal for one in made)
     n = base + carries * p
     results = max(contract.results_of(one.derivatives, one.internal, p) for one in made)
     wide = -4 * (-n // 4)
     row = contract.RESULTS + results
     width = row + max(one.columns for one in made)
-    places, groups_of, reach = order(shape, numbers, nodes) if shape.degree else ([], [], 0)
     size = carries if shape.degree else 0
+    places, reach = order(groups_of, groups) if size else ((), 0)
     parameters = max(one.derivatives for one in made)
     internal = any(one.kind == INTERNAL for one in made)
     fades = not shape.integrated and made[0].flows == FADES
@@ -189,7 +160,7 @@ def lay_out(shape: Shape) -> Layout:
     arrays = (
         numbers.view(np.int64).tolist(), [0, *shape.ends], [k for pair in directions for k in pair],
         [own if k == i else -1 for i in range(count) for k, own in directions],
-        kinds, [0] * (run.SYSTEMS * size), places, groups_of,
+        kinds, [0] * (run.SYSTEMS * size), places, groups_of[:size],
     )  # fmt: skip
     at = np.cumsum([0, *(lengths[name] for name in run.FLOATS)])
     whole = np.cumsum([run.WORDS, *map(len, arrays)])
@@ -201,4 +172,10 @@ def lay_out(shape: Shape) -> Layout:
         row, width, count, groups, nodes, p, base, carries, shape.terms, shape.top,
         int(shape.solved), wide, shape.degree, reach, 0, 0, 0, 0,
     ]  # fmt: skip
-    return Layout(np.array([*words, *(k for one in arrays for k in one)], np.int64), int(at[-1]))
+    return np.array([*words, *(k for one in arrays for k in one)], np.int64), int(at[-1])
+
+
+def memory_of(shape: Shape) -> Memory:
+    """Return the memory of a new run."""
+    words, floats = lay_out(shape)
+    return words.copy(), np.zeros(floats)

@@ -16,7 +16,7 @@ from foamfit.solve import cache, histories, scene as scenes
 from foamfit.solve.compiled import along, loop, rates, static
 from foamfit.solve.compiled.run import AT, ENDED, FINITE, NOW, OUTCOME, POINTS, SWITCHES, TOLD
 from foamfit.solve.compiled.samples import increases
-from foamfit.solve.layout import Layout, Memory, Shape, lay_out
+from foamfit.solve.layout import Memory, Shape, memory_of
 from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM, NO_SWITCHES, Motion as Motion, Slopes
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled, slopes_of
@@ -138,11 +138,11 @@ class Plan:
 
     # ------------------------------------------------------------------ arrays of the solver
 
-    def _layout(
+    def _memory(
         self, rows: Array, damped: bytes, directions: Directions, degree: int = 0,
         integrated: bool = True,
-    ) -> Layout:  # fmt: skip
-        """Return where everything of a run lies; `damped` is whether each spring has a dashpot."""
+    ) -> Memory:  # fmt: skip
+        """Return the memory of a run; `damped` is whether each spring has a dashpot."""
         terms = self.terms
         if terms and not rows[:, 1 : 1 + 2 * terms : 2].any():  # no strength: as without terms
             terms = terms if (directions[:, 1] >= OWN_RELAXATION).any() else 0
@@ -150,7 +150,7 @@ class Plan:
             self.laws.records, terms, self.ends, self.top, damped, directions.tobytes(),
             self.speed > 0.0, degree, integrated,
         )  # fmt: skip
-        return lay_out(shape)
+        return memory_of(shape)
 
     def _slopes(self, rows: Array) -> Array:
         return slopes_of(self.laws.made, rows[:, 1 + 2 * self.terms :])
@@ -241,7 +241,7 @@ class Plan:
 
         Return the memory as the run has left it.
         """
-        memory = self._layout(rows, damped, directions, degree).memory()
+        memory = self._memory(rows, damped, directions, degree)
         drive = self.mass, reals, self.values, self.time
         cache.timed(loop.integrate, *memory, rows, heights, *drive, out, log)
         return memory
@@ -303,7 +303,7 @@ class Plan:
         out = np.empty((1 + len(directions), 1 + shown, n))
         reals = np.array((0.0, 1.0, 0.0, rtol))
         damped = (rows[:, 0] > 0.0).tobytes()
-        memory = self._layout(rows, damped, directions, integrated=False).memory()
+        memory = self._memory(rows, damped, directions, integrated=False)
         given = *memory, rows, heights
         if alone:
             own, strain = directions[:, 1].tolist(), self.values / heights

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -107,8 +107,7 @@ def _verified(
         rates = scene.fastest_rates(rows, heights, scene.drag)
         explicit = max(rates) / 3.0 <= plans.MOST_WORK / len(heights)
         motion, scene = _resolve_vibrations(scene, motion, rtol, explicit, run)
-    distance = _distance(scene, arrays, motion)
-    by_stress = _distance_by_stress(scene, arrays, motion)
+    distance, by_stress = _distances(scene, arrays, motion)
     if scene.speed > 0.0 and not arrays.damped:  # its peak may lie between two samples
         distance = min(distance, by_stress)
     if 0.3 * rtol * distance < 1e-15:
@@ -233,28 +232,21 @@ def _hard(scene: Plan, arrays: ChainArrays) -> bool:
     return bool(0.5 * scene.mass.item(-1) * scene.speed**2 >= 6.0 * arrays.steep)
 
 
-def _poles(scene: Plan, arrays: ChainArrays) -> Iterator[tuple[int, float, float]]:
-    """Yield number, ε_* and k_c of each spring whose strain stays below 1 + ε_*."""
-    at = 1 + 2 * scene.terms
+def _distances(scene: Plan, arrays: ChainArrays, motion: Motion) -> tuple[float, float]:
+    """Return the least distance, in strain, of any spring from 1 + ε_*; at most 1.
+
+    The first is that at a sample. The second is a lower bound, also between samples, where a mass
+    may rebound from the end of a branch: that at which branch c has the largest stress of any
+    spring.
+    """
+    at, sampled, least = 1 + 2 * scene.terms, 1.0, 1.0
+    strain = np.diff(motion.displacement, axis=0, prepend=0.0).max(axis=1) / arrays.heights
     for i, one in enumerate(scene.laws.made):
         if one.pole >= 0:
-            yield i, arrays.rows.item(i, at + one.pole), arrays.rows.item(i, at + one.slopes[1])
-
-
-def _distance(scene: Plan, arrays: ChainArrays, motion: Motion) -> float:
-    """Return the least distance, in strain, of any spring from 1 + ε_* at a sample; at most 1."""
-    strain = np.diff(motion.displacement, axis=0, prepend=0.0).max(axis=1) / arrays.heights
-    left = [1.0 - (strain.item(i) - max(star, 0.0)) for i, star, _ in _poles(scene, arrays)]
-    return float(min([1.0, *left]))
-
-
-def _distance_by_stress(scene: Plan, arrays: ChainArrays, motion: Motion) -> float:
-    """Return a lower bound of the distance of any strain from 1 + ε_*, also between samples.
-
-    It is that at which branch c has the largest stress of any spring. A mass may rebound from the
-    end of a branch between two samples.
-    """
-    return min([1.0, *(kc / (kc + motion.strongest) for _, _, kc in _poles(scene, arrays))])
+            star, kc = (arrays.rows.item(i, at + k) for k in (one.pole, one.slopes[1]))
+            sampled = min(sampled, 1.0 - (strain.item(i) - max(star, 0.0)))
+            least = min(least, kc / (kc + motion.strongest))
+    return sampled, least
 
 
 @dataclass(frozen=True, eq=False)
