@@ -16,7 +16,7 @@ from foamfit.solve.compiled import run
 from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled import compiled, contract
 from foamfit.springs.compiled.contract import BY_STRESS, FADES, INTERNAL
-from foamfit.springs.laws.record import Law
+from foamfit.springs.laws.record import DRAG, OWN_ETA, OWN_HEIGHT, Law
 
 Memory = tuple[NDArray[np.int64], Array]  # the integers and floats of a run
 
@@ -142,10 +142,10 @@ def lay_out(shape: Shape) -> tuple[NDArray[np.int64], int]:
     fades = not shape.integrated and made[0].flows == FADES
     relaxes = shape.terms > 0 and shape.degree == 0 and shape.integrated and not internal
     relaxes = relaxes and groups == 1 and shape.top in (MOTION, STRESS) and not any(shape.damped)
-    aside = relaxes * count * (4 + 8 * shape.terms), count * (1 + shape.terms) + groups + 1
+    aside = relaxes * count * (4 + 8 * shape.terms), count + 1
     lengths = {
         "springs": count * width, "per_mass": groups, "drive": len(run.DRIVE), "carried": groups,
-        "own": (2 * count + 1) * p, "held": 2 * count * p, "part": 2 * count * p,
+        "held": 2 * count * p, "part": 2 * count * p,
         "common": (groups + 3) * p, "strain": count * p,
         "scales": run.SCALES + count + 2 * nodes + internals,
         "now": len(run.NOW), "stage": run.STAGES * wide, "line": run.LINE * wide, "y": wide,
@@ -157,10 +157,12 @@ def lay_out(shape: Shape) -> tuple[NDArray[np.int64], int]:
         "systems": 2 * run.SYSTEMS * size * (3 * reach + 1),
         "right": 2 * run.SYSTEMS * size,
     }  # fmt: skip
+    named = [*([i, what] for i in range(count) for what in (OWN_HEIGHT, OWN_ETA)), [-1, DRAG]]
+    own = np.array([float(one == other) for one in named for other in directions])
     arrays = (
         numbers.view(np.int64).tolist(), [0, *shape.ends], [k for pair in directions for k in pair],
-        [own if k == i else -1 for i in range(count) for k, own in directions],
-        kinds, [0] * (run.SYSTEMS * size), places, groups_of[:size],
+        [what if k == i else -1 for i in range(count) for k, what in directions],
+        own.view(np.int64).tolist(), kinds, [0] * (run.SYSTEMS * size), places, groups_of[:size],
     )  # fmt: skip
     at = np.cumsum([0, *(lengths[name] for name in run.FLOATS)])
     whole = np.cumsum([run.WORDS, *map(len, arrays)])

@@ -32,49 +32,38 @@ def _begin_piece(c, k):
 @inner
 def _begin_ramp(c, want):
     """Begin a ramp to the first sample of a drive. Under a prescribed stress dashpots are rigid."""
-    r, drive, t, terms = c.now, c.drive, c.time, c.terms
+    r, drive, t = c.now, c.drive, c.time
     brief = RAMP * (t[c.samples - 1] - t[0]) if c.samples > 1 else RAMP
     r.now, r.begun, r.horizon, r.piece, r.paused = 0.0, t[0] - brief, brief, -1.0, math.inf
-    aside, masses = c.aside, past(c.aside, c.count * (1 + terms))
-    for g in range(c.groups):
-        masses[g], c.per_mass[g] = c.per_mass[g], 0.0
-    masses[c.groups] = drive.pace
+    c.aside[c.count] = drive.pace
     drive.value, drive.value_rate, drive.pace = 0.0, c.values[0] / brief, 0.0
     drive.shift, drive.shift_rate = 0.0, in_contact(c, c.none) / brief
     for i in range(c.first[c.groups - 1], c.count):
         s, n = spring(c, i), numbers(c, i)
-        kept = past(aside, i * (1 + terms))
-        kept[0], s.gain = s.eta, 1.0
+        c.aside[i], s.gain = s.eta, 1.0
         if s.eta > 0.0:
             s.eta = 0.0 if c.top == MOTION else math.inf
             n.fixed = int(c.top == MOTION and n.eps_at >= 0)
-        for k in range(terms):
-            kept[1 + k], s.g[k] = s.g[k], 0.0
     rates(c, c.y, c.stage, want, 0.0)
 
 
 @inner
 def _end_ramp(c, want):
     """Let time pass again: relaxation terms begin at zero, and dashpots at the present strain."""
-    y, p, terms = c.y, c.p, c.terms
-    aside, masses = c.aside, past(c.aside, c.count * (1 + terms))
+    y, p, aside = c.y, c.p, c.aside
     rates(c, y, c.stage, want, c.now.now)
-    c.drive.pace, c.now.grow, c.now.paused = masses[c.groups], 1.0, 0.0
-    for g in range(c.groups):
-        c.per_mass[g] = masses[g]
+    c.drive.pace, c.now.grow, c.now.paused = aside[c.count], 1.0, 0.0
     for i in range(c.first[c.groups - 1], c.count):
         s, n = spring(c, i), numbers(c, i)
-        kept = past(aside, i * (1 + terms))
         strain, part = past(c.strain, i * p), past(c.part, i * p)
-        for k in range(terms):
-            s.g[k] = kept[1 + k]
+        for k in range(c.terms):
             y[n.z_at + k] = -s.sigma
             for j in range(p):
                 y[c.base + (n.z_at + k) * p + j] = -(s.steep * strain[j] + part[j])
         sum_gain(c, i)
-        if kept[0] == 0.0:
+        if aside[i] == 0.0:
             continue
-        s.eta = kept[0]
+        s.eta = aside[i]
         if n.eps_at >= 0 and c.top == MOTION:
             y[n.eps_at] = s.eps
             for j in range(p):

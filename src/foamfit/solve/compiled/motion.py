@@ -52,7 +52,7 @@ def follow_spring(c, i, eps, y, f, want):
     stress = s.gain * sigma
     for k in range(c.terms):
         z = y[n.z_at + k]
-        dz = -(z + sigma) / s.tau[k]
+        dz = -(z + sigma) / s.tau[k] * c.drive.pace
         f[n.z_at + k] = dz
         stress += s.g[k] * z
         drift += s.g[k] * dz
@@ -112,8 +112,8 @@ def derive_inside(c, i, y, f, quicker):
     part, strain = past(c.part, i * p), past(c.strain, i * p)
     owned, slope = past(c.owned, i * p), s.steep
     for k in range(c.terms):
-        at, per = c.base + (n.z_at + k) * p, 1.0 / s.tau[k]
-        more, of_tau = (y[n.z_at + k] + s.sigma) * per * per, OWN_RELAXATION + 2 * k + 1
+        at, per = c.base + (n.z_at + k) * p, c.drive.pace / s.tau[k]
+        more, of_tau = (y[n.z_at + k] + s.sigma) * per / s.tau[k], OWN_RELAXATION + 2 * k + 1
         for j in range(p):
             f[at + j] = -per * (y[at + j] + slope * strain[j] + part[j])
             if owned[j] == of_tau:
@@ -218,7 +218,7 @@ def _derive_one(c, g, i, y, f):
 def _accelerate(c, g, y, f, want, at):
     """Fill the rates of a node, and of their derivatives."""
     p, last = c.p, g == c.groups - 1
-    v, per, drag = y[2 * g + 1], c.per_mass[g], 0.0
+    v, per, drag = y[2 * g + 1], c.per_mass[g] * c.drive.pace, 0.0
     if last:
         drag = c.drive.dragged
         force = c.drive.value + c.drive.value_rate * at - c.carried[g] - drag * v

@@ -24,28 +24,30 @@ from numba import types
 
 from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import REAL, REALS_AT, WHOLE, address, inner, past, start
-from foamfit.springs.laws.record import DRAG, OWN_ETA, OWN_HEIGHT
 
 # Arrays of floats: numbers that change during a run; blocks of `width` numbers of the springs (see
 # `compiled.contract`); area over mass of the nodes; the drive now; stress of each group;
-# derivatives of height and eta of each spring and of drag; of the held numbers of each spring; of
-# the stress of each spring at fixed strain, then of its T at fixed strain; of the stress of each
-# group, then zeros and two rows to work with; of the strains; scales of the kinds of components;
-# rates at the stages of a step; its dense output; the state, that at the end of a step, and one
-# between with its rates; zeros; errors; samples that are computed together; what is set aside
-# during a ramp, see `drive`. Those of implicit steps: Jacobian, n rows of 2 reach + 1;
-# vibrations, see `rates.remember`; values of the derivatives over the scales; a copy of `springs`
-# and `carried`; factored systems, complex, SYSTEMS of n rows of 3 reach + 1, and their right sides.
+# derivatives of the held numbers of each spring; of the stress of each spring at fixed strain, then
+# of its T at fixed strain; of the stress of each group, then zeros and two rows to work with; of
+# the strains; scales of the kinds of components; rates at the stages of a step; its dense output;
+# the state, that at the end of a step, and one between with its rates; zeros; errors; samples that
+# are computed together; what is set aside during a ramp, see `drive`. Those of implicit steps:
+# Jacobian, n rows of 2 reach + 1; vibrations, see `rates.remember`; values of the derivatives over
+# the scales; a copy of `springs` and `carried`; factored systems, complex, SYSTEMS of n rows of
+# 3 reach + 1, and their right sides.
 FLOATS = (
-    "now", "springs", "per_mass", "drive", "carried", "own", "held", "part", "common", "strain",
+    "now", "springs", "per_mass", "drive", "carried", "held", "part", "common", "strain",
     "scales", "stage", "line", "y", "new", "state", "f", "nil", "errors", "batch", "aside",
     "jacobian", "alive", "largest", "kept", "systems", "right",
 )  # fmt: skip
 # Arrays of integers: rows of NUMBERS of the springs; first spring of each group, and their number;
 # directions of the derivatives, (p, 2); of each spring and direction its second number if the first
-# is that of the spring, else -1; kinds of the components. Those of implicit steps: pivots, SYSTEMS
-# of n; places of the components in the systems, and their groups.
-INTEGERS = ("numbers", "first", "directions", "owned", "kinds", "pivots", "places", "groups_of")
+# is that of the spring, else -1; as floats, derivatives of height and eta of each spring, and of
+# drag; kinds of the components. Those of implicit steps: pivots, SYSTEMS of n; places of the
+# components in the systems, and their groups.
+INTEGERS = (
+    "numbers", "first", "directions", "owned", "own", "kinds", "pivots", "places", "groups_of"
+)  # fmt: skip
 GIVEN = ("time", "values", "out", "log")  # arrays of the caller
 ADDRESSES = (
     "rates_at", "group_at", "inside_at", "change_at", "step_at", "advance_at", "drive_at",
@@ -118,7 +120,8 @@ def _named(name: str, kind: Any, fields: tuple[str, ...]) -> Any:
 _NUMBERS = _named("Numbers", WHOLE, NUMBERS)
 _KINDS = {
     **dict.fromkeys((*FLOATS, *GIVEN), REALS_AT), **dict.fromkeys(INTEGERS, contract.WHOLES_AT),
-    "springs": contract.SPRING, "numbers": _NUMBERS, "drive": _named("Drive", REAL, DRIVE),
+    "springs": contract.SPRING, "numbers": _NUMBERS, "own": REALS_AT,
+    "drive": _named("Drive", REAL, DRIVE),
     "now": _named("Now", REAL, NOW),
     **dict.fromkeys(("systems", "right"), contract.COMPLEXES_AT),
 }  # fmt: skip
@@ -219,12 +222,4 @@ def begin_run(ints, floats, time, values, out, log, rows, heights, mass, reals):
     for g in range(c.groups):
         c.per_mass[g] = 1.0 / heavy[g]
     c.drive.dragged, c.drive.pace = settings[0], settings[1]
-    for j in range(c.p):
-        i, what = c.directions[2 * j], c.directions[2 * j + 1]
-        if what == OWN_HEIGHT:
-            c.own[2 * i * c.p + j] = 1.0
-        elif what == OWN_ETA:
-            c.own[(2 * i + 1) * c.p + j] = 1.0
-        elif what == DRAG:
-            c.own[2 * c.count * c.p + j] = 1.0
     return c
