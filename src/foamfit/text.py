@@ -142,6 +142,11 @@ def option_value(value: object) -> str:
     return f"{value:g}" if short else str(value)
 
 
+def warning(text: str) -> str:
+    """Write a warning with its label, which replaces the word with which a note asks to check."""
+    return f"warning: {text.removeprefix('Check: ')}"
+
+
 def line_width() -> int:
     """Return the line length of the terminal; `WIDTH` at most, and without a terminal."""
     return max(min(shutil.get_terminal_size((WIDTH, 24)).columns, WIDTH), NARROWEST)

@@ -130,7 +130,7 @@ def test_the_rows_stand_in_the_terminal_and_in_the_result(tmp_path):
     result = fabricated.result(measurement=read_test(path))
     told = summary_text(result)
     assert "rows: 101 read, 100 used; not used: 1 (the time stamp of the row before" in told
-    assert "warning: Check: 1 of 101 rows" in told
+    assert "warning: 1 of 101 rows" in told
     assert "rows: Not used: row 9: the time" in summary_text(result, verbose=True)
     data = result.to_json_dict()["data"]
     assert (data["rows"], data["used"]) == (101, 100)

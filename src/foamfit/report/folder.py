@@ -96,7 +96,7 @@ class Result:
 def brief(title: str, line: str, rows: Sequence[Readable]) -> str:
     """Return a result in a few lines: a line about it, and its parameters."""
     marks = {"weak": " (weak)", "not determined": " (not determined)"}
-    values = (f"{p.label} {p.with_unit(p.with_error)}{marks.get(p.state, '')}" for p in rows)
+    values = (f"{p.told}{marks.get(p.state, '')}" for p in rows)
     return "\n".join([*wrapped(f"{title}: {line}", 2), *wrapped(", ".join(values), 2)])
 
 

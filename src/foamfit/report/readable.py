@@ -47,6 +47,11 @@ class Readable:
         return number if own else f"{number} {self.unit}".removesuffix(" –")
 
     @property
+    def told(self) -> str:
+        """Name, value, standard error and unit."""
+        return f"{self.label} {self.with_unit(self.with_error)}"
+
+    @property
     def tied(self) -> bool:
         """Whether an expression of other parameters gives the value."""
         return self.state == "fixed" and self.why.startswith("tied by")

@@ -42,7 +42,7 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    for name in ("percent", "engineering", "significant", "signed", "number", "field"):
+    for name in ("percent", "engineering", "significant", "signed", "number", "field", "warning"):
         made.filters[name] = getattr(text, name)
     made.filters.update(counted=text.counted, listed=text.listed, in_unit=in_unit, exp=math.exp)
     made.filters.update(paragraphs=_paragraphs, aligned=_aligned)

@@ -1,23 +1,23 @@
-"""Conclusions, terminal output and HTML report of a fit."""
+"""Terminal output and HTML report of a fit."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 from foamfit.data.measurement import interior_channel
 from foamfit.fitting.branches import covered
 from foamfit.fitting.nuisance import POSITIVE
-from foamfit.parts import ParameterEstimate
 from foamfit.report.figures import images
 from foamfit.report.plots import origin_word
 from foamfit.report.readable import Readable, readable
-from foamfit.report.render import page, sentences, table, words
+from foamfit.report.render import page, table, words
 from foamfit.report.tables import count_determined
 from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import aligned, counted, percent, wrapped
-from foamfit.trust.covariance import RULE, WEAK
+from foamfit.text import aligned, counted, percent, warning, wrapped
+from foamfit.trust.covariance import RULE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,26 +37,25 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
     """Return the text that the command prints after a fit: one screen of 80 columns and 24 lines.
 
     If the table is too long, parameters that are not determined and those of the record are moved
-    to a line below; if it is still too long, several parameters are set side by side without
-    intervals. Warnings are cut. With `verbose` nothing is cut, and the ladder, the reason of each
-    state, the checklist and the notes are added.
+    to a line below; if it is still too long, it becomes two columns of values. Warnings are cut.
+    With `verbose` nothing is cut, and the ladder, the reason of each state, the checklist and the
+    notes are added.
     """
-    ladder, measured = result.ladder, result.measurement
     rows = [readable(name, p) for name, p in result.parameters.items()]
     values: dict[str, Any] = {
         "result": result,
-        "m": measured,
-        "ladder": ladder,
+        "m": result.measurement,
+        "ladder": result.ladder,
         "shown": misfit_words(misfits(result)),
         "fixed": [row for row in rows if row.state == "fixed"],
         "determined": determined(result),
-        "unknown": _unknown(_of_springs(result), "report"),
+        "unknown": _unknown(result),
         "verbose": verbose,
         "remedies": [one.lines[0] for one in result.contradictions if one.lines],
     }
     *lines, last = _screen(result, rows, values)
     if verbose:
-        values |= {"rows": rows, "conclusions": conclusions(result), "answers": ANSWERS}
+        values |= {"rows": rows, "answers": ANSWERS}
         lines.append("\n" + words("summary", **values, **tables(result)) + "\n")
     return "\n".join([*lines, last, *(line for _, line in values["remedies"])])
 
@@ -76,14 +75,16 @@ def _screen(result: Fit, rows: list[Readable], values: dict[str, Any]) -> Iterat
     springs = [row for row in estimated if row.name not in NUISANCE]
     lines, kept = 10**6 if verbose else LINES, min(len(warnings), WARNING_LINES)
     lines -= len(values["remedies"])
-    stages = [(varied, True, 1), (varied, False, 1), (estimated, False, 1)]
-    for shown, whole, across in [*stages, *((springs, False, i) for i in (1, 2, 3))]:
+    stages = varied, varied, estimated, springs, list[Readable]()
+    for stage, shown in enumerate(stages):
         left = [row for row in varied if row not in shown and row.name in NUISANCE]
         left.sort(key=lambda row: row.name not in POSITIVE)  # the calibration first
-        record = [f"{row.label} {row.with_unit(row.with_error)}" for row in left]
-        more = {"whole": whole, "stated": across == 1, "of_record": record}
+        more = {"whole": stage == 0, "stated": bool(shown), "of_record": [row.told for row in left]}
         foot = words("short", part="foot", **more, **values).split("\n")
-        table = aligned(_table(shown, short=not verbose, across=across)) if shown else []
+        half, told = -(-len(springs) // 2), [row.told for row in springs]
+        table = aligned([*zip_longest(told[:half], told[half:], fillvalue="")])
+        if shown:
+            table = aligned(_table(shown, short=not verbose))
         room = lines - len(head) - len(foot) - len(table) - 1
         if room >= kept:
             break
@@ -95,25 +96,15 @@ def _screen(result: Fit, rows: list[Readable], values: dict[str, Any]) -> Iterat
     yield foot[-1]
 
 
-def _table(rows: list[Readable], *, short: bool, across: int) -> list[list[str]]:
-    """Return a table of parameters, head first; in a `short` one the range replaces the error.
-
-    With several parameters `across` only values are shown, or values with errors for two.
-    """
+def _table(rows: list[Readable], *, short: bool) -> list[list[str]]:
+    """Return a table of parameters, head first; in a `short` one the range replaces the error."""
     ranged = any(row.range for row in rows)
-    bare = across == 3 or (across == 1 and short and ranged)
-    value = {"value": "value"} if bare else {"value ± stderr": "with_error"}
-    columns = {"parameter": "label", **value, "unit": "unit"}
-    if across == 1:
-        columns |= {"95 % interval": "interval"} | ({"range": "range"} if ranged else {})
-        columns |= {"state": "state"}
-    tall = -(-len(rows) // across)
-    lines = [
-        [getattr(row, column) for row in rows[line::tall] for column in columns.values()]
-        for line in range(tall)
-    ]
-    head = [*columns] * across
-    return [head, *([*cells, *[""] * (len(head) - len(cells))] for cells in lines)]
+    columns = {"parameter": "label", "value ± stderr": "with_error", "unit": "unit"}
+    if short and ranged:
+        columns = {"parameter": "label", "value": "value", "unit": "unit"}
+    columns |= {"95 % interval": "interval"} | ({"range": "range"} if ranged else {})
+    columns |= {"state": "state"}
+    return [[*columns], *([getattr(row, one) for one in columns.values()] for row in rows)]
 
 
 def _cut(line: str) -> str:
@@ -122,10 +113,10 @@ def _cut(line: str) -> str:
 
 def _fitting(warnings: list[str], room: int) -> list[str]:
     """Return the warnings in `room` lines: the last ones are cut, then omitted."""
-    paragraphs = [wrapped(f"warning: {warning}", 2, COLUMNS) for warning in warnings]
+    paragraphs = [wrapped(warning(one), 2, COLUMNS) for one in warnings]
     for i in reversed(range(len(warnings))):
         if sum(map(len, paragraphs)) > room:
-            paragraphs[i] = [_cut(f"warning: {warnings[i]}")]
+            paragraphs[i] = [_cut(warning(warnings[i]))]
     if len(warnings) > room:
         more = counted(len(warnings) - room + 1, "more warning")
         paragraphs[room - 1 :] = [[f"and {more}: see the report, or --verbose"]]
@@ -147,54 +138,23 @@ def misfit_words(misfits: Mapping[str, float | None]) -> str:
     return ", ".join(known)
 
 
-def conclusions(result: Fit) -> tuple[str, ...]:
-    """Return sentences on the quality of the fit and on determined and undetermined parameters.
-
-    Further sentences describe microscale springs and relaxation.
-    """
-    springs = _of_springs(result)
-    halves = {  # half of the 95 % interval over the value
-        name: 0.5 * (p.ci95[1] - p.ci95[0]) / abs(p.value)
-        for name, p in springs.items()
-        if p.state == "determined" and p.ci95 is not None and p.value
-    }
-    # Wider ones are determined by a scale that is not their value.
-    widths = sorted((half, name) for name, half in halves.items() if half <= WEAK)
-    found, varied = count_determined(result.parameters)
-    return sentences(
-        "conclusions",
-        result=result,
-        shown={name: one for name, one in misfits(result).items() if one is not None},
-        determined=found,
-        varied=varied,
-        widths=widths[:1] + widths[1:][-1:],
-        unknown=_unknown(springs, "table of parameters"),
-        weakest=[] if result.insight is None else list(result.insight.weakest()[1]),
-    )
-
-
-def _of_springs(result: Fit) -> dict[str, ParameterEstimate]:
-    return {name: p for name, p in result.parameters.items() if name not in NUISANCE}
-
-
 def determined(result: Fit) -> str:
     """Return how many parameters of the springs are determined, in words; "" if none is varied."""
     found, varied = count_determined(result.parameters)
     return f"{found} of {varied} determined" if varied else ""
 
 
-def _unknown(
-    parameters: dict[str, ParameterEstimate], place: str
-) -> dict[str, dict[str, list[str]]]:
-    """Group the weak and undetermined parameters by state and reason, or by its `place` if long."""
+def _unknown(result: Fit) -> dict[str, dict[str, list[str]]]:
+    """Group the weak and undetermined parameters of the springs by state and reason."""
     grouped = dict[str, dict[str, list[str]]]()
     for state in ("not determined", "weak"):
-        every = {name: p.why for name, p in parameters.items() if p.state == state}
-        reasons = dict.fromkeys(every.values())
-        groups = {why: [name for name, own in every.items() if own == why] for why in reasons}
+        groups = dict[str, list[str]]()
+        for name, p in result.parameters.items():
+            if p.state == state and name not in NUISANCE:
+                groups.setdefault(p.why, []).append(name)
         text = "; ".join(f"{', '.join(names)} ({why})" for why, names in groups.items())
         if len(text) > LONGEST:
-            groups = {f"reasons in the {place}": list(every)}
+            groups = {"reasons in the report": [one for names in groups.values() for one in names]}
         if groups:
             grouped[state] = groups
     return grouped
@@ -222,7 +182,6 @@ def render_report(result: Fit, drawn: Mapping[str, Figure], fit_svg: bytes | Non
         "report",
         result=result,
         origin=origin_word(result),
-        conclusions=conclusions(result),
         determined=determined(result),
         misfits=misfits(result),
         statistics=plain["statistics"],

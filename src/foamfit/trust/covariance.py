@@ -297,7 +297,7 @@ def state(
         return "not determined", "the data fix only a combination of it with other parameters"
     ratio = half / size
     if half > NOTHING * size:
-        wide = "more than 100 times" if ratio > 100.0 else f"±{ratio:.2g} times"
+        wide = "more than 100 times" if ratio > 100.0 else f"±{percent(ratio)} of"
         return "not determined", f"its {what} is {wide} {of}"
     for limit in limits:
         if abs(value - limit) <= AT_LIMIT * size:
