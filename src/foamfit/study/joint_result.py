@@ -26,7 +26,7 @@ from foamfit.report import figures
 from foamfit.report.folder import Result, brief, write_json, write_result, write_text
 from foamfit.report.listing import Row, table_of
 from foamfit.report.plots import draw_loops
-from foamfit.report.readable import readable
+from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page, sentences, words
 from foamfit.report.studies.parameters import Panel, plot_parameters
 from foamfit.report.tables import MISFITS, formula, frame, parameters_tex, stacked, symbols
@@ -175,8 +175,8 @@ class JointResult(Result, OfLaw):
         every = {n: p for n, p in self.parameters.items() if p.kind != "fixed" or p.value}
         known = [one.misfit for one in self.tests.values()]
         curves = [n for n in MISFITS if any(misfit.get(n) is not None for misfit in known)]
-        more: Any = {"parameters": every, "nuisance": NUISANCE, "between": _between}
-        return words("joint", found=self, most=MOST_ROWS, curves=curves, readable=readable, **more)
+        more: Any = {"parameters": every, "nuisance": NUISANCE, "shown": _shown}
+        return words("joint", found=self, most=MOST_ROWS, curves=curves, **more)
 
     def write(self, folder: Path, *, pages: bool = True, width: str = figures.TWO) -> None:
         """Write joint.json, its page, its figure, table.tex, and a result folder per test."""
@@ -200,6 +200,14 @@ class JointResult(Result, OfLaw):
         for one in content["parameters"].values():
             one["state"] = one["state"] or None  # of an own parameter
         return content
+
+
+def _shown(name: str, one: ParameterEstimate) -> Readable:
+    """Return a parameter in readable form; the range of an own one is that of its values."""
+    if one.kind == "own" and one.tests:
+        values = [own.value for own in one.tests.values()]
+        one = replace(one, range=(min(values), max(values)))
+    return readable(name, one)
 
 
 def _between(one: ParameterEstimate) -> str:
