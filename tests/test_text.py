@@ -60,7 +60,7 @@ def test_lines_keep_their_width_and_their_words() -> None:
     assert all(line.startswith("  word") for line in lines[1:])
     # No line begins with the % sign of a number.
     assert t.wrapped("a spread of 4.1 % to 20 %", width=15) == ["a spread of", "  4.1 % to 20 %"]
-    lines = t.labelled([("done", [text, "end"]), ("none", [])]).splitlines()
+    lines = t.labelled([("done", text), ("", "end")]).splitlines()
     assert lines[1].startswith(" " * 12 + "word")
     assert lines[-1] == " " * 10 + "end"
 

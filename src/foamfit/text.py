@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 import shutil
@@ -191,11 +192,7 @@ def aligned(
     return lines
 
 
-def labelled(items: Iterable[tuple[str, Iterable[str]]]) -> str:
-    """Write each label followed by its texts, wrapped from `COLUMN` on; no final newline."""
-    lines = list[str]()
-    for label, texts in items:
-        for i, text in enumerate(texts):
-            start = label if i == 0 else ""
-            lines += wrapped(f"{start:<{COLUMN}}{text}", COLUMN + 2)
-    return "\n".join(lines)
+def labelled(items: Iterable[tuple[str, str]]) -> str:
+    """Write each label, or "", and its text, wrapped from `COLUMN` on; no final newline."""
+    lines = (wrapped(f"{label:<{COLUMN}}{text}", COLUMN + 2) for label, text in items)
+    return "\n".join(itertools.chain.from_iterable(lines))

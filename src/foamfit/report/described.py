@@ -47,7 +47,7 @@ def describe(test: Measurement, audit: EnergyAudit) -> str:
         ],
         exact=taken_for_exact(test),
     )
-    return labelled((label, [text]) for label, _, text in (line.partition("¦") for line in lines))
+    return labelled((label, text) for label, _, text in (line.partition("¦") for line in lines))
 
 
 def taken_for_exact(test: Measurement) -> dict[str, str]:
