@@ -134,8 +134,7 @@ def compare(results: Sequence[Result], published: str | None = None) -> Comparis
 def recognised(test: str) -> str | None:
     """Return the published set that is named in the name of a test, if there is one."""
     plain = partial(re.sub, r"[\s/_-]+", "-")
-    longest_first = sorted(published_sets, key=len, reverse=True)
-    patterns = {rf"(?<![a-z0-9]){plain(name)}(?![0-9a-z])": name for name in longest_first}
+    patterns = {rf"(?<![a-z0-9]){plain(name)}(?![0-9a-z])": name for name in published_sets}
     named = (name for word, name in patterns.items() if re.search(word, plain(test.casefold())))
     return next(named, None)
 

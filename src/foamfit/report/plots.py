@@ -52,7 +52,6 @@ def plot_fit(result: Fit, *, width: str = TWO) -> Figure:
     narrower figure.
     """
     name = printable(" ".join(result.measurement.name.split()))
-    name = name if len(name) <= 60 else name[:59] + "…"
     word = origin_word(result)
     more = [word] if word and word not in name.lower() else []
     more += [f"stopped by {result.stopped}"] if result.stopped else []

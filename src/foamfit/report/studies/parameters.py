@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from os.path import commonprefix
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -86,7 +85,8 @@ def plot_parameters(
     """
     wide, count, n = figures.inches(width), len(tests), max(len(panels), 1)
     step = max(-(-count // MOST_ROWS), 1)  # of very many tests only some are named
-    names = _short(tests, int(min(0.28 * wide, 1.3) / LETTER))[::step]
+    most = int(min(0.28 * wide, 1.3) / LETTER)
+    names = [figures.tail(name, most) for name in tests][::step]
     margin = LETTER * max(map(len, names), default=3) + 0.1
     across = figures.abreast(wide - margin, n, LEAST_PANEL)
     rows = -(-n // across)
@@ -112,15 +112,6 @@ def plot_parameters(
             figures.say_nothing_there(axes[0], "no parameter to compare")
         figures.legend_below(figure, axes, first=_MARKS)
     return figure
-
-
-def _short(tests: Sequence[str], most: int) -> list[str]:
-    """Shorten names to `most` letters: cut their common end, then the beginning."""
-    if all(len(name) <= most for name in tests):
-        return list(tests)
-    end = len(commonprefix([name[::-1] for name in tests])) if len(tests) > 1 else 0  # noqa: RUF071
-    cut = [name[: len(name) - end] or name for name in tests]
-    return [figures.tail(name, most) for name in cut]
 
 
 def _draw(ax: Axes, panel: Panel, tests: Sequence[str], roomy: bool) -> None:

@@ -286,10 +286,6 @@ def _map(ax: Axes, plan: Plan) -> None:
     if at and at[0] in x and at[1] in y:
         star: Any = {"color": VERMILION, "ms": 11, "mec": "white", "ls": "none"}
         ax.plot(x.index(at[0]), y.index(at[1]), "*", label="advised test", **star)
-    for mass, (half, _) in plan.closing.items():
-        if mass in y and x[0] < half < x[-1]:
-            row, place = y.index(mass), np.interp(np.log(half), np.log(x), range(len(x)))
-            ax.plot([place] * 2, [row - 0.5, row + 0.5], color="black", linewidth=1.0, ls="--")
     few = np.unique(np.linspace(0, len(x) - 1, 5).astype(int))
     ax.set_xticks(few, [f"{x[column]:.2g}" for column in few])
     ax.set_yticks(range(len(y)), [engineering(1e3 * b, "g") if impact else f"{b:.2g}" for b in y])
