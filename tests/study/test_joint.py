@@ -116,7 +116,7 @@ def test_linked_values_are_one_value_bit_for_bit(found, tmp_path, monkeypatch):
     assert read.parameters["s1_kc"] == found.parameters["s1_kc"]
     pd.testing.assert_frame_equal(read.table(), found.table())
     assert read.results["t1"].parameters["s1_k0"].value == value
-    for one, other in zip(read.loops, found.loops, strict=True):
+    for one, other in zip(read.loops.values(), found.loops.values(), strict=True):
         assert one.name == other.name
         np.testing.assert_array_equal(one.along, other.along)
         np.testing.assert_allclose(one.fitted, other.fitted)

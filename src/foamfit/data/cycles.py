@@ -35,7 +35,6 @@ _BEGUN = 3.0  # multiple of the least load above which the first rise has certai
 _AT_PEAK = 3.0  # samples within this many standard deviations below the largest may be the peak
 _CLOSE = 0.95  # share of the peak from which a parabola leads to it
 _HELD = 1.15  # ratio of the middle of a peak to its end on a parabola above which it is a hold
-_FINE = 20  # points per sample of a fitted motion
 
 
 @dataclass(frozen=True)
@@ -335,21 +334,16 @@ def inner_reversals(displacement: Array) -> list[str]:
     ]
 
 
-def loading_rate(test: Measurement, fitted: Array | None = None) -> float | None:
+def loading_rate(test: Measurement) -> float | None:
     """Return the mean strain rate from contact to the largest strain, 1/s; None without a time.
 
     The peak is the middle of the samples that may be the largest in view of the noise, or the start
-    of a hold. If given, the `fitted` displacement (m) is used instead; it has no noise.
+    of a hold.
     """
-    from scipy.interpolate import CubicSpline
-
     if test.time is None or test.displacement is None:
         return None
     time, motion, noise = test.time, test.displacement, test.noise.of("displacement")
     sigma = noise.sigma if noise else 0.0
-    if fitted is not None:  # the peak of a smooth motion lies between samples
-        fine = np.linspace(time[0], time[-1], _FINE * time.size)
-        time, motion, sigma = fine, CubicSpline(time, fitted)(fine), 0.0
     if test.striker is not None and time[0] < 0.0:  # neither flight nor rest before contact loads
         motion = np.append(np.interp(0.0, time, motion), motion[time > 0.0])
         time = np.append(0.0, time[time > 0.0])

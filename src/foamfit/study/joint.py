@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median_low
@@ -25,7 +26,6 @@ from foamfit.fitting.problem import Problem, fix_and_vary, make_params
 from foamfit.fitting.search import Tracker, descend
 from foamfit.fitting.together import Together, fit_linked
 from foamfit.one_model import Options, Progress, identify
-from foamfit.report.folder import check_target
 from foamfit.springs.model import Model
 from foamfit.study.joint_fit import Vectors, fit_jointly
 from foamfit.study.joint_result import Alternative, JointResult, result_of
@@ -64,12 +64,7 @@ class _Test:
 
 @single_threaded
 def joint(
-    path: str | Path | Study,
-    *,
-    out: str | Path | None = None,
-    seed: int | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    path: str | Path | Study, *, seed: int | None = None, progress: Progress = lambda *_: None
 ) -> JointResult:
     """Fit the tests of a study together; returns a `JointResult`.
 
@@ -78,8 +73,6 @@ def joint(
     path : str, Path or Study
         STUDY.toml, or the result of `read_study`: tests, model, drive, and for each parameter its
         kind ("shared", "own", "scatter", "log rate", "power rate" or "auto") or a fixed value.
-    out : str or Path, optional
-        Folder for the result, written as by `JointResult.save` with or without `report`.
     seed : int, optional
         Seed of the search; by default the seed of the study, or 0.
     progress : callable, optional
@@ -93,38 +86,29 @@ def joint(
     SimulationError
         If no start of the joint fit can be simulated.
     """
-    began, tell = time.perf_counter(), progress or (lambda *_: None)
-    study = path if isinstance(path, Study) else read_study(path)
+    began, study = time.perf_counter(), path if isinstance(path, Study) else read_study(path)
     study = study if seed is None else replace(study, seed=seed)
-    if out is not None:
-        check_target(out, of="joint.json")
-    options = Options(
-        drive=study.drive, seed=study.seed, starts=study.starts, relaxation=study.relaxation
-    )
-    tests, refused = _read(study, options, tell)
+    keys = ("drive", "seed", "starts", "relaxation")
+    options = Options(**{key: getattr(study, key) for key in keys})
+    tests, refused = _read(study, options, progress)
     _links(study, tests)  # rejects invalid kinds before anything is fitted
-    tests, alone = _own_fits(study, options, tests, refused, tell)
+    tests, alone = _own_fits(study, options, tests, refused, progress)
     links, starts = _links(study, tests), alone.starts(ONE_FOR_ALL)
     rates = [test.rate for test in tests]
     # The evidence is not computed for scatter, nor for rate laws if all rates are equal.
-    kinds = [kind for kind in KINDS if kind not in ("scatter", *RATES)]
-    kinds += RATES if None not in rates and _several(rates) else ()
-    tell(0.5, "together")
+    kinds = ["shared", "own", *(RATES if None not in rates and _several(rates) else ())]
+    progress(0.5, "together")
     auto = [name for name, kind in study.kinds.items() if kind == AUTO and name in alone.own]
     if auto:
         links = choose_kinds(alone, links, auto, starts, kinds)
     fit = fit_jointly(alone.problems, links, starts)
-    tell(0.9, "evidence")
+    progress(0.9, "evidence")
     every = (*fit.found.shared, *fit.found.own)
     compared = [name for name in every if links.kind(name) in RATES or name in auto]
     tried, slopes = evidence(fit.found, compared, kinds, alone)
     files, took = {test.name: test.file for test in tests}, time.perf_counter() - began
     about = {"evidence": tried, "refused": refused, "runtime_s": took, "rate0": _median_rate(rates)}
-    result = result_of(study, files, rates, fit, alone, slopes, **about)
-    tell(1.0, "done")
-    if out is not None:
-        result.save(out, report=report)
-    return result
+    return result_of(study, files, rates, fit, alone, slopes, **about)
 
 
 def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], dict[str, str]]:
@@ -229,35 +213,25 @@ def _own_fits(
     order = sorted(range(len(tests)), key=lambda t: (tests[t].rate or 0.0, t))
     places = np.unique(np.linspace(0, len(order) - 1, min(SEARCHED, len(order))).astype(int))
     first = [order[place] for place in places]
-    found = dict[int, _Test]()
-
-    def do(chosen: Sequence[int], near: tuple[Array, ...], done: float) -> None:
-        for i, t in enumerate(chosen):
-            try:
-                found[t] = _own_fit(tests[t], study.model, options, near)
-            except SimulationError as error:
-                if t not in found:
-                    refused[str(tests[t].file)] = str(error)
-            tell(done + 0.2 * (i + 1) / len(chosen), "each test")
-
-    do(first, (), 0.1)
-    near = tuple(found[t].values for t in first if t in found)
-    worst = max((found[t].cost for t in first if t in found), default=math.inf)
-    do([t for t in order if t not in first], near, 0.3)
-    do([t for t in order if t not in first and t in found and found[t].cost > FAR * worst], (), 0.3)
+    found, near, worst = dict[int, _Test](), list[Array](), math.inf
+    for i, t in enumerate([*first, *(t for t in order if t not in first)]):
+        if i == len(first) and found:
+            near, worst = [x.values for x in found.values()], max(x.cost for x in found.values())
+        try:
+            found[t] = _own_fit(tests[t], study.model, options, near)
+            if found[t].cost > FAR * worst:
+                found[t] = _own_fit(tests[t], study.model, options, ())
+        except SimulationError as error:
+            if t not in found:
+                refused[str(tests[t].file)] = str(error)
+        tell(0.1 + 0.4 * (i + 1) / len(tests), "each test")
     _check_two(study, len(found), refused)
     kept = [found[t] for t in sorted(found)]
-    for t, test in enumerate(kept):
-        objective, measurement = test.problem.objective, test.problem.measurement
-        if objective.drive == "impact" and test.rate is not None:
-            # The rate of the fitted motion, which has no noise.
-            motion = objective.simulate(test.values, everything=True).curves["displacement_time"]
-            kept[t] = replace(test, rate=loading_rate(measurement, motion))
     problems, values = [test.problem for test in kept], [test.values for test in kept]
     return kept, Together.of_own_fits(problems, values)
 
 
-def _own_fit(test: _Test, model: str, options: Options, near: tuple[Array, ...]) -> _Test:
+def _own_fit(test: _Test, model: str, options: Options, near: Sequence[Array]) -> _Test:
     """Fit one test, starting from the points `near` it or else by a search."""
     measurement, params = test.problem.measurement, test.problem.told()
     if not near:
@@ -283,10 +257,12 @@ def evidence(
     """
     found, wide = list[Alternative](), dict[str, float]()
     for name in names:
-        present, near = fit.links.kind(name), [fit.values, alone.values]
-        for kind, other in _kinds_of(fit, name, (present, *kinds), near, wide):
-            bic = other.bic(alone.n_eff)
-            found.append(Alternative(name, kind, kind == present, bic, other.n_vary, other.cost))
+        present = fit.links.kind(name)
+        fits, half = _of_kinds(fit, name, kinds, alone)
+        wide |= {name: half} if half > covariance.WEAK else {}
+        for kind, one in fits.items():
+            bic = one.bic(alone.n_eff)
+            found.append(Alternative(name, kind, kind == present, bic, one.n_vary, one.cost))
     return tuple(found), wide
 
 
@@ -298,43 +274,33 @@ def choose_kinds(
     All are shared at first; each round makes the change of one kind that lowers BIC most. A rate
     law is not tried if the tests do not determine its slope (`open_slope`).
     """
-    now = fit_linked(alone.problems, links.having(**dict.fromkeys(names, "shared")), starts)
-    n_eff = alone.n_eff
-    while True:
-        trials = [
-            fit
-            for name in names
-            for kind, fit in _kinds_of(now, name, kinds, [now.values, alone.values], {})
-            if kind != now.links.kind(name)
-        ]
-        best = min(trials, key=lambda fit: fit.bic(n_eff), default=now)
-        if best.bic(n_eff) >= now.bic(n_eff):
-            return now.links
+    best = fit_linked(alone.problems, links.having(**dict.fromkeys(names, "shared")), starts)
+    now = None
+    while best is not now:
         now = best
+        trials = [one for n in names for one in _of_kinds(now, n, kinds, alone)[0].values()]
+        best = min([now, *trials], key=lambda fit: fit.bic(alone.n_eff))
+    return best.links
 
 
-def _kinds_of(
-    fit: Together, name: str, kinds: Sequence[str], near: Sequence[Vectors], wide: dict[str, float]
-) -> Iterator[tuple[str, Together]]:
-    """Yield fits with each of these kinds of a parameter, and the other parameters as they are.
+def _of_kinds(
+    fit: Together, name: str, kinds: Sequence[str], alone: Together
+) -> tuple[dict[str, Together], float]:
+    """Return fits with each of these kinds of a parameter, and its `open_slope`; 0 if unknown.
 
-    Kinds that cannot be simulated are omitted, and rate laws if the slope is not determined, in
-    which case `open_slope` is entered in `wide`.
+    The other parameters keep their kinds. Kinds that cannot be simulated are omitted, and rate laws
+    if the slope is not determined.
     """
-    present = fit.links.kind(name)
-    for kind in sorted(dict.fromkeys(kinds), key=lambda kind: (kind in RATES, kind != present)):
-        if kind in RATES and kind != present and name in wide:
+    present, half, out = fit.links.kind(name), 0.0, dict[str, Together]()
+    for kind in sorted({present, *kinds}, key=KINDS.index):
+        if kind in RATES and kind != present and half > covariance.WEAK:
             continue
-        try:
-            links = fit.links.having(**{name: kind})
-            other = fit if kind == present else fit_linked(fit.problems, links, near)
-        except SimulationError:
-            continue
-        yield kind, other
-        if kind == "own" and any(law in RATES for law in kinds):
-            half = open_slope(other, name)
-            if half > covariance.WEAK:
-                wide[name] = half
+        with suppress(SimulationError):
+            links, near = fit.links.having(**{name: kind}), [fit.values, alone.values]
+            out[kind] = fit if kind == present else fit_linked(fit.problems, links, near)
+            if kind == "own" and {*RATES} & {*kinds}:
+                half = open_slope(out[kind], name)
+    return out, half
 
 
 def open_slope(fit: Together, name: str) -> float:

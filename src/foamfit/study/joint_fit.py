@@ -9,9 +9,9 @@ them (`trust.scatter`). This is repeated until the spread no longer changes (Lap
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 from foamfit.text import counted
 from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.budget import judged, settle
+from foamfit.trust.budget import Settled, judged, settle
 from foamfit.trust.covariance import Ends
 from foamfit.trust.intervals import FAR, HARDLY_WORSE
 from foamfit.trust.joint_point import Error, JointPoint
@@ -67,6 +67,20 @@ class JointFit:
     def found(self) -> Together:
         """The fitted tests at the best point."""
         return self.point.found
+
+    @cached_property
+    def _settled(self) -> tuple[tuple[Settled, ...], ...]:
+        return tuple(settle(best, best.contradictions) for best in self.point.bests)
+
+    def contested(
+        self, one: ParameterEstimate, name: str, tests: Sequence[int]
+    ) -> ParameterEstimate:
+        """Return an estimate with the state that contradictions in these records leave it."""
+        for settled, best in ((self._settled[t], self.point.bests[t]) for t in tests):
+            if settled and one.ci95 is not None:
+                state, why = judged(settled, best, name, one.ci95, (one.state, one.why))
+                one = replace(one, state=state, why=why)
+        return one
 
 
 def fit_jointly(problems: Sequence[Problem], links: Links, starts: Sequence[Vectors]) -> JointFit:
@@ -267,29 +281,11 @@ def _held(point: JointPoint, name: str, sign: float) -> float:
 def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, ParameterEstimate]:
     """Return all parameters of the joint fit, those of the springs first."""
     problems = fit.found.problems
-    found = {
+    return {
         name: parameter_of(fit, tests, name)
         for name in (*problems[0].model.names, *NUISANCE)
         if any(name in one.index and not one.is_exact(name) for one in problems)
     }
-    for test, best in zip(tests, fit.point.bests, strict=True):
-        settled = settle(best, best.contradictions)
-        for name in best.problem.free() if settled else ():
-            found[name] = _contested(found[name], test, partial(judged, settled, best, name))
-    return found
-
-
-def _contested(
-    one: ParameterEstimate, test: str, judge: Callable[[Ends, tuple[str, str]], tuple[str, str]]
-) -> ParameterEstimate:
-    """Return a parameter with the states that contradictions in the record of a test leave it."""
-    if one.ci95 is not None and one.state:
-        state, why = judge(one.ci95, (one.state, one.why))
-        one = replace(one, state=state, why=why)
-    if one.tests is None or test not in one.tests:
-        return one
-    own = _contested(one.tests[test], "", judge)
-    return replace(one, tests={**one.tests, test: own})
 
 
 def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> ParameterEstimate:
@@ -306,9 +302,9 @@ def parameter_of(fit: JointFit, tests: tuple[str, ...], name: str) -> ParameterE
         why = "one value for each test; this is their median"
         return replace(_BLANK, value=value, unit=unit_of(name), why=why, kind=kind, tests=each)
     if kind == "scatter":
-        return _scattering(fit, name, each)
+        return fit.contested(_scattering(fit, name, each), name, free)
     (value, *slope), span = found.common[name], fit.ranges.get(name)
-    one = _judged(fit, free[0], name, span)
+    one = fit.contested(_judged(fit, free[0], name, span), name, free)
     why = f"one value for {counted(len(free), 'test')}: {one.why}"
     if not slope:
         return replace(one, why=why, kind=kind)
@@ -390,5 +386,6 @@ def _values(fit: JointFit, tests: tuple[str, ...], name: str) -> dict[str, Param
             one = replace(one, state="not determined", why=why)
         else:
             one = _judged(fit, t, name, fit.own[t].get(name), own=True)
-        out[test] = one.counted_from(-problem.measurement.origins.get(name, 0.0))
+        one = one.counted_from(-problem.measurement.origins.get(name, 0.0))
+        out[test] = fit.contested(one, name, [t])
     return out

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,6 @@ from foamfit.codec import plain
 from foamfit.data.measurement import ASKED
 from foamfit.data.zeros import CONTRADICTED
 from foamfit.fitting.links import RATES
-from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import SearchRecord
 from foamfit.fitting.together import Together
 from foamfit.parts import OfLaw, ParameterEstimate
@@ -30,15 +28,15 @@ from foamfit.report.readable import Readable, readable
 from foamfit.report.render import page, sentences, words
 from foamfit.report.studies.parameters import Panel, plot_parameters
 from foamfit.report.tables import MISFITS, formula, frame, parameters_tex, stacked, symbols
-from foamfit.results import Fit, Loop, loop_of, stamp
+from foamfit.results import Loop, stamp
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.joint_fit import LARGEST, JointFit, parameters_of
 from foamfit.study.study_file import Study
 from foamfit.text import counted, number, readable_unit
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.checklist import POOR, UNACCEPTABLE, status_of, warnings_of
-from foamfit.trust.conclude import conclude, noise_of
+from foamfit.trust.checklist import misfits_of, status_of, warnings_of
+from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import RULE, Ends
 
 if TYPE_CHECKING:
@@ -46,7 +44,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_NOT_IN_FILE = ("loops", "fits", "fit")  # fields that joint.json does not contain
+_NOT_IN_FILE = ("results", "fit")  # fields that joint.json does not contain
 _OF_A_SEARCH = ("ended", "agree")  # items of the checklist that apply only to a search
 # More than this share of χ², and this multiple of its share of samples, make a test dominant.
 DOMINANT, MORE = 0.5, 2.0
@@ -113,16 +111,14 @@ class JointResult(Result, OfLaw):
     warnings: tuple[str, ...] = ()
     sentences: tuple[str, ...] = ()
     runtime_s: float = math.nan
-    loops: tuple[Loop, ...] = ()  #: Measured and fitted loop of each test
-    #: Result of each test, or a function that makes it
-    fits: tuple[Fit | Callable[[], Fit], ...] = ()
+    results: dict[str, FitResult] = field(default_factory=dict)  #: Of each test
     fit: JointFit | None = None  #: The fit itself; None if the result was read from its folder
 
-    @cached_property
-    def results(self) -> dict[str, FitResult]:
-        """Result of each test at the joint fit."""
-        made = (one if isinstance(one, Fit) else one() for one in self.fits)
-        return {name: FitResult(**vars(one)) for name, one in zip(self.tests, made, strict=True)}
+    @property
+    def loops(self) -> dict[str, Loop]:
+        """Measured and fitted loop of the tests that have one."""
+        loops = {name: one.loop for name, one in self.results.items()}
+        return {name: loop._replace(name=name) for name, loop in loops.items() if loop is not None}
 
     @property
     def rates(self) -> tuple[float | None, ...]:
@@ -147,7 +143,7 @@ class JointResult(Result, OfLaw):
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the loops of all tests, measured and fitted, into axes or a new figure."""
-        return draw_loops(self.loops, ax)
+        return draw_loops(self.loops.values(), ax)
 
     def table(self) -> pd.DataFrame:
         """Return a row for each test and parameter, in SI; common values have the test "".
@@ -245,7 +241,7 @@ def plot_joint(found: JointResult, *, width: str = figures.TWO) -> Figure:
 
     Tests are sorted by rate if rates differ; see `plot_parameters`.
     """
-    names, every = _in_order(found), {one.name: one for one in found.loops}
+    names, every = _in_order(found), found.loops
     loops = [every[test]._replace(name=name) for test, name in names.items() if test in every]
     panels = [
         Panel(
@@ -265,33 +261,30 @@ def _in_order(found: JointResult) -> dict[str, str]:
 
     Rates differ if a parameter follows a rate law, or by the factor `SEVERAL_RATES`.
     """
-    known = [rate for rate in found.rates if rate]
-    least = 1.0 if any(one.kind in RATES for one in found.parameters.values()) else SEVERAL_RATES
-    all_known = least == 1.0 or len(known) == len(found.tests)
-    if found.rate0 is None or not all_known or max(known) <= least * min(known):
+    rates = {test: one.rate or 0.0 for test, one in found.tests.items()}
+    law = any(one.kind in RATES for one in found.parameters.values())
+    if not law and not 0.0 < SEVERAL_RATES * min(rates.values()) < max(rates.values()):
         return {test: test for test in found.tests}
-    rates = dict(zip(found.tests, found.rates, strict=True))
-    tests = sorted(found.tests, key=lambda test: rates[test] or 0.0)
-    return {t: t if rates[t] is None else f"{t}, {rates[t]:.2g}/s" for t in tests}
+    tests = sorted(rates, key=rates.__getitem__)
+    return {t: f"{t}, {rates[t]:.2g}/s" if rates[t] else t for t in tests}
 
 
 def fit_of_test(
-    problem: Problem, values: Array, varied: dict[str, ParameterEstimate], note: str, seed: int
-) -> Fit:
-    """Return the result of a test in a joint fit; `systematic` is from this test alone.
-
-    `varied` are its estimates in the joint fit.
-    """
-    problem.put(values)
-    alone = conclude(BestPoint(problem, values), SearchRecord(seed, 0, time.perf_counter()))
+    best: BestPoint, joint: Mapping[str, ParameterEstimate], test: str, note: str, seed: int
+) -> FitResult:
+    """Return the result of a test in a joint fit; `systematic` is from this test alone."""
+    best.problem.put(best.values)
+    alone = conclude(best, SearchRecord(seed, 0, time.perf_counter()))
     checks = tuple(check for check in alone.checklist if check.key not in _OF_A_SEARCH)
     verdict: Any = {"status": status_of(checks), "warnings": warnings_of(checks), "budget": None}
-    own = {
-        name: replace(varied.get(name, one), systematic=one.systematic)
-        for name, one in alone.parameters.items()
-    }
+    own = dict(alone.parameters)
+    for name in best.problem.free():
+        one, kept = joint[name].in_test(test), own[name]
+        method, systematic = one.ci95 and "local covariance", kept.systematic
+        own[name] = replace(one, value=kept.value, ci95_method=method, systematic=systematic)
     notes = (note, *alone.notes)
-    return replace(alone, parameters=own, notes=notes, checklist=checks, **verdict)
+    made = replace(alone, parameters=own, notes=notes, checklist=checks, **verdict)
+    return FitResult(**vars(made))
 
 
 def result_of(
@@ -313,30 +306,22 @@ def result_of(
     shares = np.divide(found.costs, total) if total else np.full(len(tests), 1.0 / len(tests))
     others = counted(len(tests) - 1, "other test")
     note = f"Fitted together with {others} ({study.name}): intervals use all of them."
-    of_tests, fits, loops = dict[str, JointTest](), list[Callable[[], Fit]](), list[Loop]()
-    pairs = zip(tests.items(), rates, fit.point.bests, strict=True)
-    for t, ((name, file), rate, best) in enumerate(pairs):
-        problem, values, curves = best.problem, found.values[t], best.simulated.curves
-        measurement, objective = problem.measurement, problem.objective
-        told = dict(zip(problem.names, (values + problem.origins).tolist(), strict=True))
-        varied = {n: parameters[n].in_test(name) for n in problem.free()}
-        for n, one in varied.items():
-            method = one.ci95 and "local covariance"
-            varied[n] = replace(one, value=told[n], ci95_method=method)
+    of_tests, results = dict[str, JointTest](), dict[str, FitResult]()
+    for (name, file), rate, best, share in zip(
+        tests.items(), rates, fit.point.bests, shares.tolist(), strict=True
+    ):
+        results[name] = one = fit_of_test(best, parameters, name, note, study.seed)
         of_tests[name] = JointTest(
             file=str(file),
-            drive=objective.drive,
+            drive=one.drive,
             rate=rate,
-            misfit=found.misfits[t],
-            chi2_share=float(shares[t]),
-            noise=noise_of(best, fit.point.errors[t]),
-            n_data=objective.n_data,
-            data_sha256=measurement.data_sha256,
-            values={n: value for n, value in told.items() if not problem.is_exact(n)},
+            misfit=one.misfit,
+            chi2_share=share,
+            noise=one.noise,
+            n_data=best.problem.objective.n_data,
+            data_sha256=one.measurement.data_sha256,
+            values={n: p.value for n, p in one.parameters.items()},
         )
-        fits.append(partial(fit_of_test, problem, values, varied, note, study.seed))
-        loop = loop_of(measurement, curves.get("stress_strain"), curves.get("stress_time"))
-        loops += [] if loop is None else [loop._replace(name=name)]
     drives = {one.drive for one in of_tests.values()}
     result = JointResult(
         **{name: getattr(study, name) for name in ("name", "model", "relaxation", "seed")},
@@ -346,7 +331,6 @@ def result_of(
         covariance={"names": fit.point.names, "matrix": _common_covariance(fit)},
         specimens={"names": fit.correlation[0], "correlation": fit.correlation[1]},
         statistics={
-            "n_tests": len(found.problems),
             "n_data": found.n_data,
             "n_vary": found.n_vary,
             "chisqr": found.cost,
@@ -355,11 +339,8 @@ def result_of(
             "n_eff": alone.n_eff,
             "bic": found.bic(alone.n_eff),
             "bic_alone": alone.bic(alone.n_eff),
-            "n_vary_alone": alone.n_vary,
-            "chisqr_alone": alone.cost,
         },
-        loops=tuple(loops),
-        fits=tuple(fits),
+        results=results,
         fit=fit,
         **about,
     )
@@ -383,7 +364,7 @@ def _with_words(
     result: JointResult, fit: JointFit, alone: Together, open_slopes: Mapping[str, float]
 ) -> JointResult:
     """Return a joint fit with its status, warnings and sentences."""
-    lost, large, wrong, missed = dict[str, None](), list[Any](), list[Any](), list[float]()
+    lost, large, wrong, missed = list[str](), list[Any](), list[Any](), list[float]()
     doubts = dict[str, list[str]]()  # tests by their notes about probable errors in the input
     every = zip(result.tests.items(), fit.point.bests, fit.point.errors, strict=True)
     for (test, one), best, errors in every:
@@ -391,21 +372,17 @@ def _with_words(
         pairs = zip(objective.counted, errors, strict=True)
         shares = [error.law / objective.span(curve) for curve, error in pairs if error.found]
         missed += [max(shares)] if shares else []
-        measurement = best.problem.measurement
-        for note in measurement.notes:
+        for note in best.problem.measurement.notes:
             if note.startswith(ASKED) and CONTRADICTED not in note:
                 doubts.setdefault(note.removeprefix(ASKED).strip(), []).append(test)
         wrong += [(test, each, objective.drive) for each in best.contradictions]
-        for curve in objective.counted:
-            misfit, measured = one.misfit[curve], objective.measured[curve]
-            if misfit is None or not misfit <= UNACCEPTABLE * np.std(measured) / np.ptp(measured):
-                lost[test] = None
-            elif misfit > POOR:
-                large.append((test, curve, misfit))
+        followed = misfits_of(best, one.misfit)
+        lost += [test] * any(curve["lost"] for curve in followed)
+        large += [(test, curve["name"], curve["off"]) for curve in followed if curve["poor"]]
     rates = [rate for rate in result.rates if rate is not None]
     first, top = max(result.tests.items(), key=lambda pair: pair[1].chi2_share)
     slopes = [(name, result.parameters[name].kind, half) for name, half in open_slopes.items()]
-    told: dict[str, Any] = {"result": result, "laws": RATES, "slopes": slopes, "lost": list(lost)}
+    told: dict[str, Any] = {"result": result, "laws": RATES, "slopes": slopes, "lost": lost}
     told |= {"large": large, "wrong": wrong, "doubts": doubts, "missed": missed}
     told |= {"rates": f"{min(rates):.3g} to {max(rates):.3g} 1/s" if rates else ""}
     told |= {"top": (first, top), "dominant": max(DOMINANT, MORE * top.n_data / fit.found.n_data)}

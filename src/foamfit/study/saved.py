@@ -88,11 +88,8 @@ def _joint(folder: Path) -> JointResult:
     content = load_result(folder / "joint.json")
     with reading(f"{folder / 'joint.json'}"):
         given = content | {"model": Model.of_result(content).name}
-        made: JointResult = build(JointResult, given, {})
-    fits = {name: _fit(folder / name) for name in made.tests}
-    loops = ((name, one.loop) for name, one in fits.items())
-    found = tuple(loop._replace(name=name) for name, loop in loops if loop is not None)
-    return replace(made, loops=found, fits=tuple(fits.values()))
+        made: JointResult = build(JointResult, given | {"results": {}}, {})
+    return replace(made, results={name: _fit(folder / name) for name in made.tests})
 
 
 def _cycles(folder: Path) -> CycleFits:

@@ -125,12 +125,18 @@ def _of_search(best: BestPoint, record: SearchRecord) -> Iterator[Check]:
     yield _check("vibration", not vibrates)
 
 
-def _followed(best: BestPoint, misfit: Mapping[str, float | None]) -> Check:
+def misfits_of(best: BestPoint, misfit: Mapping[str, float | None]) -> list[dict[str, Any]]:
+    """Return the misfit of each fitted curve, whether it is large, and whether unacceptable."""
     objective, curves = best.problem.objective, []
     for name in objective.counted:
         share, measured = misfit[name] or 0.0, objective.measured[name]
         lost = share * float(np.ptp(measured)) > UNACCEPTABLE * float(np.std(measured))
         curves.append({"name": name, "off": share, "lost": lost, "poor": share > POOR or lost})
+    return curves
+
+
+def _followed(best: BestPoint, misfit: Mapping[str, float | None]) -> Check:
+    curves = misfits_of(best, misfit)
     fine, fatal = not any(one["poor"] for one in curves), any(one["lost"] for one in curves)
     return _check("followed", fine, fatal=fatal, curves=curves)
 
