@@ -170,7 +170,7 @@ def test_expected_widths_are_those_of_a_joint_fit_with_the_advised_test(of_publi
     assert [one.study for one in tests] == ["both", "both"]
     tests[0].values[at := tests[0].problem.index["s1_kc"]] *= 10.0  # as a fit that leaves it open
     known = plan_module.known_of(tests, rng, 0)
-    assert known.drawn[0, at] == pytest.approx(joint.parameters["s1_kc"].value, rel=0.1)
+    assert known.drawn[0].springs[at] == pytest.approx(joint.parameters["s1_kc"].value, rel=0.1)
 
 
 def test_a_spring_that_may_not_have_snapped_is_hit_harder(monkeypatch):
@@ -219,9 +219,10 @@ def test_slopes_of_a_quantity_are_its_differences(name, motion):
     asked = as_test(known, Candidate("impact", 7e-3, 3.0), rig, with_motion=True)
     for i, parameter in enumerate(known.names):
         step = np.zeros(len(problem.names))
-        step[problem.index[parameter]] = 1e-5 * known.sizes[0, i]
+        step[problem.index[parameter]] = 1e-5 * known.drawn[0].sizes[i]
         # To one side, as the spring is not damped.
-        at = [Target._in_draw(name, known, asked, known.draws[0] + i * step)[0] for i in range(3)]
+        moved = (known.drawn[0].springs + i * step for i in range(3))
+        at = [Target._in_draw(name, known, asked, springs)[0] for springs in moved]
         slope = (4.0 * at[1] - at[2] - 3.0 * at[0]) / 2e-5
         # The absorbed energy is that of the striker; its slopes are those of the sampling.
         size = target.middle if name == "absorbed_energy" else np.abs(target.slopes).max()

@@ -11,9 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
-from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -27,24 +26,13 @@ from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Layout, Together, fit_linked
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study import gain
-from foamfit.study.gain import OF_DRAWS, Known, Test
+from foamfit.study.gain import Draw, Known, Test
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
 from foamfit.trust.ranges import ALIKE
 
 TRIES = 60  # attempts per draw
 FROM = 3  # number of minima from which springs with fewer branches are sought
-
-
-@dataclass(frozen=True, eq=False)
-class Explanation:
-    """Parameters of the tests at hand that explain them; the rest is as in `Known`."""
-
-    vectors: tuple[Array, ...]  # of each test
-    sizes: Array  # (k,)
-    bread: Array  # (k, k)
-    meat: Array  # (k, k)
-    reached: Mask  # (k,)
 
 
 def known_of(
@@ -59,38 +47,33 @@ def known_of(
     names = tuple(name for name in first.free() if name not in NUISANCE)
     missed, share, roots = _of_fits(tests, names)
 
-    def explained(vectors: Sequence[Array]) -> Explanation:
+    def explained(vectors: Sequence[Array]) -> Draw:
         sizes, (bread, meat) = first.sizes(names, vectors[0]), np.zeros((2, len(names), len(names)))
         for test, values, root in zip(tests, vectors, roots, strict=True):
             rows = test.rows(values, names, sizes)
             # The covariance of a test alone is that of its fit, D (JᵀJ)⁻¹ D.
             alone = np.linalg.pinv(own := rows.T @ rows, rcond=1e-12, hermitian=True)
             bread, meat = bread + own, meat + own @ (alone * np.outer(root, root)) @ own
-        return Explanation(tuple(vectors), sizes, bread, meat, _reached(tests, vectors, names))
-
-    def known(drawn: Sequence[Explanation], informed: int | None = None) -> Known:
-        kept: Any = {n: np.array([getattr(one, n) for one in drawn[:informed]]) for n in OF_DRAWS}
-        springs = np.array([one.vectors[0] for one in drawn])
-        return Known(first, names, springs, missed=missed, share=share, stretch=stretch, **kept)
+        return Draw(tuple(vectors), sizes, bread, meat, _reached(tests, vectors, names))
 
     problems, links = [one.problem for one in tests], Links(dict.fromkeys(names, "shared"))
     starts = Together.of_own_fits(problems, at_hand).starts(len(tests))
     vectors = at_hand if len(tests) == 1 else fit_linked(problems, links, starts).values
-    best, stretch = explained(vectors), np.ones(len(names))
-    stretch = _stretch(known([best]), tests)
+    best, every = explained(vectors), list[Draw]()
+    known = Known(first, names, (best,), 1, missed, share, np.ones(len(names)))
+    known = replace(known, stretch=_stretch(known, tests))
     if not draws:
-        return known([best])
-    every = list[Explanation]()
+        return known
     if first.model.has_several and any(one.fit for one in tests):
         for found in _explanations(tests, vectors, names):
             with suppress(SimulationError):  # it was found with less accuracy
                 every.append(explained(found.values))
-    drawn, weights = _draws(known([best]), tests, every or [best], rng, draws)
+    drawn, weights = _draws(known, tests, every or [best], rng, draws)
     for i, one in enumerate(drawn[:informed]):
         with suppress(SimulationError):  # a coarser simulation had followed the test
-            drawn[i] = explained([test.with_springs(one.vectors[0]) for test in tests])
-    others = tuple(every[i].vectors[0] for i in np.argsort(-weights)) if every else ()
-    return replace(known(drawn, informed), explained=others)
+            drawn[i] = explained([test.with_springs(one.springs) for test in tests])
+    others = tuple(every[i].springs for i in np.argsort(-weights)) if every else ()
+    return replace(known, drawn=tuple(drawn), informed=informed or draws, explained=others)
 
 
 def _reached(tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[str]) -> Mask:
@@ -163,7 +146,7 @@ def _stretch(known: Known, tests: Sequence[Test]) -> Array:
     for fit in (one.fit for one in tests if one.fit is not None):
         for i, name in enumerate(known.names):
             if (found := fit.parameters[name].range) is not None and law[i] > 0.0:
-                half = 0.5 * (found[1] - found[0]) / known.sizes[0, i]
+                half = 0.5 * (found[1] - found[0]) / known.drawn[0].sizes[i]
                 out[i] = max(out[i], half / law[i])
     return out
 
@@ -171,10 +154,10 @@ def _stretch(known: Known, tests: Sequence[Test]) -> Array:
 def _draws(
     known: Known,
     tests: Sequence[Test],
-    every: Sequence[Explanation],
+    every: Sequence[Draw],
     rng: np.random.Generator,
     count: int,
-) -> tuple[list[Explanation], Array]:
+) -> tuple[list[Draw], Array]:
     """Return parameters that follow the tests about as well as the best point.
 
     Parameters whose branch was reached are drawn from their covariance, including model error, and
@@ -188,12 +171,12 @@ def _draws(
     allowed, prior = (ALIKE**2 - 1.0) * known.missed, np.eye(k) / NOTHING**2
     thin, n_springs = [one.problem.thinned().objective for one in tests], len(problem.model.names)
 
-    def cost(one: Explanation, values: Array) -> float:
+    def cost(one: Draw, values: Array) -> float:
         springs, pairs = values[:n_springs], zip(thin, one.vectors, strict=True)
         own = [(objective, np.append(springs, x[n_springs:])) for objective, x in pairs]
         return sum(float(np.sum(objective.residual(x) ** 2)) for objective, x in own)
 
-    bread, meat = np.diag(known.bread[0]), np.diag(known.meat[0])
+    bread, meat = (np.diag(one) for one in (known.drawn[0].bread, known.drawn[0].meat))
     noise = max(float(np.max(meat / np.maximum(bread, 1e-300))), 1.0)
     marks, steps = list[float](), list[tuple[Array, Array]]()
     costs = [cost(one, one.vectors[0]) for one in every]
@@ -208,7 +191,7 @@ def _draws(
         volume = np.linalg.slogdet(np.eye(best.size) + slopes.T @ one.bread @ slopes)[1]
         marks.append(-0.5 * (least / noise + volume))
     most = min(costs) + allowed + noise * float(stats.chi2.ppf(0.99, k))
-    weights, out = _weights(every, np.array(marks)), list[Explanation]()
+    weights, out = _weights(every, np.array(marks)), list[Draw]()
     for _ in range(count):
         chosen = int(rng.choice(len(every), p=weights)) if len(every) > 1 else 0
         one, (best, axes) = every[chosen], steps[chosen]
@@ -224,7 +207,7 @@ def _draws(
     return out, weights
 
 
-def _weights(every: Sequence[Explanation], marks: Array) -> Array:
+def _weights(every: Sequence[Draw], marks: Array) -> Array:
     """Return the probabilities of explanations; those that reach the same branches overlap."""
     kinds, weights = [one.reached.tobytes() for one in every], np.exp(marks - marks.max())
     for kind in set(kinds):

@@ -13,13 +13,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
 
 from foamfit.api import FitResult
 from foamfit.arrays import Array, Mask
+from foamfit.data.measurement import Measurement
 from foamfit.data.rig import Candidate, Rig
 from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError, SimulationError
@@ -40,7 +40,6 @@ TINY, ROUNDING = 1e-6, 1e-12  # least information on a scaled parameter, and ove
 LONGEST = 30.0  # longest contact, in times that the striker takes over the height of the specimen
 TIMED = 20  # number of draws from which the duration of an impact is taken
 UNKNOWN = 2.0 * NOTHING  # half an interval where a branch is not reached, in scales
-OF_DRAWS = ("sizes", "bread", "meat", "reached")  # arrays of `Known`
 # Quantities of `Target`; the absorbed energy is that up to the largest strain.
 UNITS = {"peak_force": "N", "absorbed_energy": "J", "dissipated_energy": "J", "peak_strain": ""}
 
@@ -90,41 +89,60 @@ class Test:
 
 
 @dataclass(frozen=True, eq=False)
+class Draw:
+    """Parameters of the tests at hand that follow them about as well as the best ones.
+
+    `bread` is JᵀJ by the k varied parameters of the springs over their `sizes`, `meat` JᵀΣJ, as
+    slopes may differ much from those of the fit. `others` are springs in series that give nearly
+    the same records.
+    """
+
+    vectors: tuple[Array, ...]  # of each test
+    sizes: Array  # (k,)
+    bread: Array  # (k, k)
+    meat: Array  # (k, k)
+    reached: Mask  # (k,): whether the branch of each parameter was reached
+    others: tuple[Other, ...] = ()
+
+    @property
+    def springs(self) -> Array:
+        """A vector of parameters with its springs."""
+        return self.vectors[0]
+
+
+@dataclass(frozen=True, eq=False)
 class Known:
     """What the tests at hand say about the k varied parameters of the springs.
 
-    `drawn` (m, n) are vectors of parameters that follow the tests about equally well. In the first
-    d of them parameters are scaled by `sizes` (d, k), `bread` (d, k, k) is JᵀJ and `meat` JᵀΣJ, as
-    slopes may differ much from those of the fit, `reached` (d, k) is whether the branch of each
-    parameter was reached, and `others` are springs in series that give nearly the same records; the
-    rest only tell how probably a limit of the rig is exceeded. `missed` is the sum of squares of
-    the model error, `share` its RMS over the ranges of the curves, `stretch` (k,) the ranges of the
-    fits over those to first order, at least 1. `explained` are vectors with springs in series that
-    explain the tests in other ways, see `draws`.
+    Of the draws, the first `informed` ones have their own information; the others only tell how
+    probably a limit of the rig is exceeded. `missed` is the sum of squares of the model error,
+    `share` its RMS over the ranges of the curves, `stretch` (k,) the ranges of the fits over those
+    to first order, at least 1. `explained` are vectors with springs in series that explain the
+    tests in other ways, see `draws`.
     """
 
     problem: Problem
     names: tuple[str, ...]
-    drawn: Array
-    sizes: Array
-    bread: Array
-    meat: Array
-    reached: Mask
+    drawn: tuple[Draw, ...]
+    informed: int
     missed: float
     share: float
     stretch: Array
     explained: tuple[Array, ...] = ()
-    others: tuple[tuple[Other, ...], ...] = ()
 
     @property
-    def draws(self) -> Array:
-        """The draws in which the information is known, (d, n)."""
-        return self.drawn[: len(self.bread)]
+    def draws(self) -> tuple[Draw, ...]:
+        """The d draws in which the information is known."""
+        return self.drawn[: self.informed]
+
+    def of_draws(self, name: str) -> Array:
+        """Return a field of these draws as an array, (d, …)."""
+        return np.array([getattr(one, name) for one in self.draws])
 
     def first(self, count: int) -> Known:
         """Return the same with the first draws only, and without other springs."""
-        own: Any = {name: getattr(self, name)[:count] for name in ("drawn", *OF_DRAWS)}
-        return replace(self, others=(), **own)
+        drawn = tuple(replace(one, others=()) for one in self.drawn[:count])
+        return replace(self, drawn=drawn, informed=min(count, self.informed))
 
     @property
     def places(self) -> list[int]:
@@ -132,9 +150,9 @@ class Known:
         return [self.problem.index[name] for name in self.names]
 
     @property
-    def best(self) -> Other:
-        """The first draw, with what the tests at hand tell about it."""
-        return Other(self.drawn[0], np.pad(self.bread[0], (0, 1)), self.reached[0])
+    def values(self) -> Array:
+        """The parameters in these draws, (d, k)."""
+        return np.array([one.springs[self.places] for one in self.draws])
 
 
 class Other(NamedTuple):
@@ -197,16 +215,22 @@ def difference(known: Known, springs: Array, sizes: Array, test: Test, residual:
     return Other(springs, rows.T @ rows, test.reached(shown, known.names))
 
 
-def as_test(known: Known, candidate: Candidate, rig: Rig, *, with_motion: bool = False) -> Test:
-    """Return a candidate with the law of the tests at hand.
+def as_test(
+    known: Known,
+    candidate: Candidate,
+    rig: Rig,
+    *,
+    record: Measurement | None = None,
+    with_motion: bool = False,
+) -> Test:
+    """Return a candidate with the law of the tests at hand, or one whose `record` is given.
 
     With `with_motion` the motion counts even if the rig does not record it.
     """
-    problem, test = known.problem, known.problem.measurement
-    lasts, peak, impact = 0.0, problem.scales.stress, candidate.drive == "impact"
-    if impact:
-        lasts, peak = _duration_and_peak(known, candidate, peak)
-    record = candidate.recorded(test, rig, lasts, peak, with_motion=with_motion)
+    problem, test, impact = known.problem, known.problem.measurement, candidate.drive == "impact"
+    if record is None:
+        timed = _duration_and_peak(known, candidate) if impact else (0.0, problem.scales.stress)
+        record = candidate.recorded(test, rig, *timed, with_motion=with_motion)
     inside = problem.objective.interior_mass and impact
     law, terms = problem.model.name, problem.model.relaxation
     params = make_params(record, law, candidate.drive, relaxation=terms)
@@ -218,21 +242,22 @@ def as_test(known: Known, candidate: Candidate, rig: Rig, *, with_motion: bool =
     return Test(made, made.vector(), weight=weight)
 
 
-def _duration_and_peak(known: Known, candidate: Candidate, usual: float) -> tuple[float, float]:
+def _duration_and_peak(known: Known, candidate: Candidate) -> tuple[float, float]:
     """Return a time (s) that covers the contact in nine of ten draws, and the median peak (Pa)."""
     specimen, model = known.problem.measurement.specimen, known.problem.model
     mass, velocity = candidate.mass or math.nan, candidate.velocity or math.nan
     limit, ends, peaks = LONGEST * specimen.height / velocity, list[float](), list[float]()
     for drawn in known.draws[:TIMED]:
         try:
-            chain = model.chain(drawn[: len(model.names)], specimen.height, specimen.area)
+            springs = drawn.springs[: len(model.names)]
+            chain = model.chain(springs, specimen.height, specimen.area)
             found = simulate(chain, Impact(mass, velocity), np.linspace(0.0, limit, 200), 1e-3)
         except (SimulationError, InputError):
             continue
         ends.append(found.contact_end or limit)
         peaks.append(float(found.base_stress.max()))
     if not ends:
-        return 0.2 * limit, usual
+        return 0.2 * limit, known.problem.scales.stress
     return 1.1 * float(np.quantile(ends, 0.9)), float(np.median(peaks))
 
 
@@ -240,16 +265,18 @@ def look(
     known: Known, candidate: Candidate, rig: Rig, rivals: Mapping[str, Known] = MappingProxyType({})
 ) -> Seen:
     """Simulate a candidate for every draw, with exact derivatives."""
-    test, (d, k) = as_test(known, candidate, rig), known.reached.shape
+    test, d, k = as_test(known, candidate, rig), len(known.draws), len(known.names)
     objective, specimen = test.problem.objective, known.problem.measurement.specimen
     own = [objective.noise(c).sigma * objective.factor(c) for c in objective.counted]
     noise = np.repeat([*own, objective.unit], [*objective.sizes, len(objective.priors)])[:, None]
-    laws = {name: (one, as_test(one, candidate, rig)) for name, one in rivals.items()}
+    record = test.problem.measurement  # a rival is compared sample by sample
+    laws = {n: (one, as_test(one, candidate, rig, record=record)) for n, one in rivals.items()}
     bread, meat = np.zeros((2, d, k, k))
     reached, broken = np.zeros((d, k), dtype=bool), np.ones(len(known.drawn), dtype=bool)
     missed, forces, apart = np.zeros(d), list[float](), dict[str, list[float]]()
     others = [tuple[Other, ...]()] * d
-    for i, values in enumerate(map(test.with_springs, known.drawn)):
+    for i, drawn in enumerate(known.drawn):
+        values = test.with_springs(drawn.springs)
         try:
             shown = objective.simulate(values, everything=True)
         except SimulationError:
@@ -259,17 +286,19 @@ def look(
         broken[i] = forces[-1] > rig.force or shown.motion.displacement[-1].max() > farthest
         if broken[i] or i >= d:  # no record
             continue
-        rows = test.rows(values, known.names, known.sizes[i])
+        rows = test.rows(values, known.names, drawn.sizes)
         bread[i], meat[i] = rows.T @ rows, (noise * rows).T @ (noise * rows)
         reached[i] = test.reached(shown, known.names)
         ranges = [np.ptp(shown.curves[c]) * objective.factor(c) for c in objective.counted]
         missed[i] = test.weight * known.share**2 * (np.square(ranges) @ objective.sizes)
         residual = objective.compare(shown, values)
-        springs = [one.springs for one in known.others[i]] if known.others else []
-        others[i] = tuple(difference(known, x, known.sizes[i], test, residual) for x in springs)
+        springs = (one.springs for one in drawn.others)
+        others[i] = tuple(difference(known, x, drawn.sizes, test, residual) for x in springs)
         for name, (law, of_law) in laws.items():
-            one = difference(law, law.drawn[0], law.sizes[0], of_law, residual)
-            rise = Other.together((law.best, one)).refit(law, law.sizes[0])[1]
+            best = law.drawn[0]
+            known_of_it = Other(best.springs, np.pad(best.bread, (0, 1)), best.reached)
+            one = difference(law, best.springs, best.sizes, of_law, residual)
+            rise = Other.together((known_of_it, one)).refit(law, best.sizes)[1]
             apart.setdefault(name, []).append(rise / (1.0 + missed[i]))
     told = {name: float(np.median(found)) for name, found in apart.items()}
     told = {name: found for name, found in told.items() if math.isfinite(found)}
@@ -282,8 +311,8 @@ def covariance(known: Known, seen: Sequence[Seen], floor: float = TINY) -> tuple
 
     `floor` is the least information on each parameter over its scale.
     """
-    bread = known.bread + sum(one.bread for one in seen)
-    meat = known.meat + sum(one.meat for one in seen)
+    bread = known.of_draws("bread") + sum(one.bread for one in seen)
+    meat = known.of_draws("meat") + sum(one.meat for one in seen)
     missed = known.missed + sum(one.missed for one in seen) * np.ones(len(bread))
     least = np.maximum(floor, ROUNDING * np.trace(bread, axis1=1, axis2=2))
     prior = least[:, None, None] * np.eye(len(known.names))
@@ -299,16 +328,17 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
     """
     noise, law = (np.diagonal(one, axis1=1, axis2=2) for one in covariance(known, seen))
     halves, ranges = (np.sqrt(np.maximum(one, 0.0)) for one in (NORMAL**2 * noise, law))
-    wider, values = np.maximum(halves, ranges), known.draws[:, known.places] / known.sizes
+    sizes, reached = known.of_draws("sizes"), known.of_draws("reached")
+    wider, values = np.maximum(halves, ranges), known.values / sizes
     clear, limits = np.abs(values) > wider, [known.problem.params[n] for n in known.names]
     least, most = np.array([(one.min, one.max) for one in limits]).T
     # As in a fit, an interval ends at the limits of its parameter.
     low, high, elsewhere = _with_others(known, seen, values, halves)
-    widths = np.minimum(high * known.sizes, most) - np.maximum(low * known.sizes, least)
+    widths = np.minimum(high * sizes, most) - np.maximum(low * sizes, least)
     shares = 0.5 * (high - low)
     wide = np.maximum(wider, shares)  # and, to one side, another minimum
     side = np.maximum(wide, np.maximum(high - values, values - low))
-    reached = np.any([known.reached, *(one.reached for one in seen)], axis=0)
+    reached = np.any([reached, *(one.reached for one in seen)], axis=0)
     out = dict[str, Expected]()
     for i, name in enumerate(known.names):
         shown = reached[:, i]
@@ -334,13 +364,13 @@ def _with_others(
     could make the best.
     """
     low, high, elsewhere = values - halves, values + halves, np.zeros(values.shape, dtype=bool)
-    for i, others in enumerate(known.others):
-        meat = known.meat[i] + sum(one.meat[i] for one in seen)
-        noise = np.trace(meat) / np.trace(known.bread[i] + sum(one.bread[i] for one in seen))
-        near = list[Array]()
-        for each in zip(others, *(one.others[i] for one in seen if one.others[i]), strict=True):
+    for i, drawn in enumerate(known.draws):
+        meat = drawn.meat + sum(one.meat[i] for one in seen)
+        noise = np.trace(meat) / np.trace(drawn.bread + sum(one.bread[i] for one in seen))
+        near, shown = list[Array](), (one.others[i] for one in seen if one.others[i])
+        for each in zip(drawn.others, *shown, strict=True):
             other = Other.together(each)
-            there, rise = other.refit(known, known.sizes[i])
+            there, rise = other.refit(known, drawn.sizes)
             if (rise := rise / (NORMAL**2 * noise)) < 1.0:
                 half = np.where(other.reached, halves[i] * math.sqrt(1.0 - rise), UNKNOWN)
                 low[i] = np.minimum(low[i], there - half)
@@ -376,7 +406,7 @@ class Target:
         if mass is None or velocity <= 0.0:
             raise InputError(f"quantity {text!r} needs a striker; give its mass in the rig")
         asked = as_test(known, Candidate("impact", mass, velocity), rig, with_motion=True)
-        found = [cls._in_draw(name, known, asked, drawn) for drawn in known.draws]
+        found = [cls._in_draw(name, known, asked, drawn.springs) for drawn in known.draws]
         values, slopes = zip(*found, strict=True)
         return cls(text, UNITS[name], np.array(values), np.array(slopes))
 
@@ -388,12 +418,14 @@ class Target:
         moves = problem.moves(values, known.names) * sizes
         places = np.flatnonzero(moves.any(axis=1))
         try:
-            rows = problem.objective.simulate(values, everything=True, places=places).rows
+            shown = problem.objective.simulate(values, everything=True, places=places)
         except SimulationError:
             return math.nan, np.full(len(known.names), math.nan)
-        through = linalg.block_diag(np.eye(1), moves[places].T)  # the curve, then its slopes
-        force = specimen.area * (through @ rows["stress_time"])
-        moved = through @ rows["displacement_time"]
+        stress, moved = (  # the curve, then its slopes
+            np.vstack((shown.curves[name], moves[places].T @ shown.slopes[name]))
+            for name in ("stress_time", "displacement_time")
+        )
+        force = specimen.area * stress
         if name in ("peak_force", "peak_strain"):
             curve = force if name == "peak_force" else moved / specimen.height
             found = curve[:, np.argmax(curve[0])]

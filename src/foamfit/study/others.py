@@ -30,25 +30,23 @@ NEAR = 60.0  # largest rise of the sum of squares, noise having a variance of 1
 EXPLAINED = 3  # number of explanations that are tried besides exchanges
 
 
-def others_of(
-    known: Known, tests: Sequence[Test], candidate: Candidate, rig: Rig
-) -> tuple[tuple[Other, ...], ...]:
-    """Return, for each drawn foam, springs that nearly give its records in the tests at hand.
+def with_others(known: Known, tests: Sequence[Test], candidate: Candidate, rig: Rig) -> Known:
+    """Return the same with springs that nearly give the records of each drawn foam.
 
-    They are sought in the tests at hand alone, and together with a candidate, among the
-    explanations of the tests and springs that have exchanged branches.
+    They are sought in these tests and a candidate, among the explanations of the tests and springs
+    that have exchanged branches.
     """
-    further, out = gain.as_test(known, candidate, rig), list[tuple[Other, ...]]()
     thin = [replace(one, problem=one.problem.thinned()) for one in tests]
-    for drawn, sizes in zip(known.draws, known.sizes, strict=True):
-        made = list[Other]()
-        pairs = [(one, one.problem.objective.residual(one.with_springs(drawn))) for one in tests]
-        for search in (thin, [*thin, further]):
-            for springs in _sought(known, drawn, sizes, search):
-                shown = [gain.difference(known, springs, sizes, *each) for each in pairs]
-                made.append(Other.together(shown))
-        out.append(tuple(made))
-    return tuple(out)
+    search, out = [*thin, gain.as_test(known, candidate, rig)], list(known.drawn)
+    for i, drawn in enumerate(known.draws):
+        every = [(one, one.with_springs(drawn.springs)) for one in tests]
+        pairs = [(one, one.problem.objective.residual(values)) for one, values in every]
+        others = list[Other]()
+        for springs in _sought(known, drawn.springs, drawn.sizes, search):
+            shown = [gain.difference(known, springs, drawn.sizes, *each) for each in pairs]
+            others.append(Other.together(shown))
+        out[i] = replace(drawn, others=tuple(others))
+    return replace(known, drawn=tuple(out))
 
 
 def _sought(known: Known, drawn: Array, sizes: Array, tests: Sequence[Test]) -> list[Array]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import combinations
 from operator import attrgetter
@@ -37,7 +36,7 @@ from foamfit.study import gain
 from foamfit.study.draws import known_of
 from foamfit.study.gain import Known, Seen, Test
 from foamfit.study.joint_result import JointResult
-from foamfit.study.others import others_of
+from foamfit.study.others import with_others
 from foamfit.study.saved import load, with_record
 from foamfit.text import counted
 
@@ -105,17 +104,15 @@ def plan(
     known = known_of(tests, rng, DRAWS, informed)
     others = {name: known_of([one], rng, 0) for name, one in rivals.items()}
     target = None if quantity is None else gain.Target.of(quantity, known, limits)
-    contradicted = known.missed > 0.0 and any(x.fit and x.fit.contradictions for x in tests)
     now = _now(known, tests)
     least = sum(one.probability for one in now.values())
     if known.explained:
         progress(0.2, "other springs that would show the same")
         some = known.first(len(known.draws) // 2)
-        rough = [_outcome(some, None, False, one, gain.look(some, one, limits)) for one in asked]
+        rough = [_outcome(some, None, one, gain.look(some, one, limits)) for one in asked]
         if likely := _advised([one for one in rough if not one.risky], least):
-            found = others_of(known, tests, likely.candidate, limits)
-            known = replace(known, others=found)
-    outcome = partial(_outcome, known, target, contradicted)
+            known = with_others(known, tests, likely.candidate, limits)
+    outcome = partial(_outcome, known, target)
     seen = list[Seen]()
     for i, one in enumerate(asked):
         progress(0.3 + 0.6 * i / len(asked), f"{counted(len(asked), 'candidate')}, {i} done")
@@ -127,7 +124,7 @@ def plan(
     pairs = [(outcome(asked[i], seen[i], seen[j]), asked[j]) for i, j in combinations(first, 2)]
     progress(0.92, "what no test of this rig determines")
     shown = [now, *(outcomes[i].expected for i in safe)]
-    never = _beyond(known, shown, limits, impacts=not contradicted)
+    never = _beyond(known, shown, limits)
     progress(0.97, "the velocity that closes the loop")
     return Plan(
         name=tests[0].study or test.name,
@@ -146,7 +143,7 @@ def plan(
         else Quantity(target.text, target.unit, target.middle, target.error(known, [])),
         rivals=tuple(others),
         missed=known.missed > 0.0,
-        contradicted=contradicted,
+        contradicted=known.missed > 0.0 and any(x.fit and x.fit.contradictions for x in tests),
         **_as_fitted(tests),
         seed=seed,
     )
@@ -232,18 +229,10 @@ def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
 # ------------------------------------------------------------------ the advice
 
 
-def _outcome(
-    known: Known, target: gain.Target | None, contradicted: bool, one: Candidate, *seen: Seen
-) -> Outcome:
-    """Return what a candidate would determine, together with others of which more is seen.
-
-    `contradicted` is whether a record contradicts itself where the law errs as well.
-    """
-    risk = np.any([each.broken for each in seen], axis=0)
+def _outcome(known: Known, target: gain.Target | None, one: Candidate, *seen: Seen) -> Outcome:
+    """Return what a candidate would determine, together with others of which more is seen."""
+    risk, found = np.any([each.broken for each in seen], axis=0), gain.expected(known, seen)
     error = None if target is None else target.error(known, seen)
-    found = gain.expected(known, seen)
-    if contradicted and one.drive == "impact":  # as in a fit
-        found = {name: x.capped() for name, x in found.items()}
     return Outcome(one, float(np.mean(risk)), found, seen[0].force, error, seen[0].apart)
 
 
@@ -277,9 +266,7 @@ def _advised(safe: Sequence[Outcome], now: float) -> Outcome | None:
     return min((one for one in near if one.narrowness <= least + WIDER), key=effort)
 
 
-def _beyond(
-    known: Known, shown: Sequence[dict[str, Expected]], rig: Rig, *, impacts: bool
-) -> dict[str, str]:
+def _beyond(known: Known, shown: Sequence[dict[str, Expected]], rig: Rig) -> dict[str, str]:
     """Return, for parameters that are never determined in `shown`, what other rig would."""
     sure = {name for each in shown for name, one in each.items() if one.state == "determined"}
     left = [name for name in known.names if name not in sure]
@@ -288,7 +275,6 @@ def _beyond(
     some = known.first(len(known.draws) // 4)
     for what, other in beyond(rig, springs) if left else ():
         made = [one for one in candidates(other, test, springs) if not one.repeat]
-        made = [one for one in made if impacts or one.drive != "impact"]
         for one in made[:: max(len(made) // 12, 1)]:
             found = gain.expected(some, [gain.look(some, one, other)])
             new = [name for name in left if found[name].state == "determined" and not out[name]]
@@ -317,7 +303,7 @@ def _closing(known: Known, mass: float, rig: Rig) -> tuple[float, float]:
         return bool(test.reached(shown, known.names).all())
 
     tried = np.geomspace(top / SLOWEST, top, SPEEDS).tolist()
-    for values in map(test.with_springs, known.drawn):
+    for values in (test.with_springs(one.springs) for one in known.drawn):
         first = next((i for i, speed in enumerate(tried) if closed(speed, values)), None)
         if first:
             ends = tried[first - 1], tried[first]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,11 +48,6 @@ class Expected:
     ci95_width_10_90: tuple[float, float]
     probability: float
     share: float
-
-    def capped(self) -> Expected:
-        """Return the same, but not determined."""
-        state = "weak" if self.state == "determined" else self.state
-        return replace(self, state=state, probability=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,9 +122,7 @@ class Plan(Result, OfLaw):
     quantity: Quantity | None
     rivals: tuple[str, ...]  #: laws of further results, which the test should tell apart
     missed: bool  #: whether the law misses the record by more than the noise
-    #: whether force, mass and motion of the record contradict each other as well; an impact of the
-    #: same rig then determines nothing
-    contradicted: bool
+    contradicted: bool  #: whether force, mass and motion of the record disagree as well
     drives: frozenset[str]  #: of the tests at hand
     held: dict[str, float]  #: spring parameters that the user has fixed, SI
     seed: int
