@@ -29,7 +29,6 @@ from foamfit.report.studies.prediction import COLOURS, PredictedCurve, Predictio
 from foamfit.springs.parameters import NUISANCE, unit_of
 from foamfit.study.identified import NORMAL, Source, read_source
 from foamfit.study.population import Population
-from foamfit.text import engineering
 from foamfit.trust import say
 
 DRAWS = 400  # default number of draws of specimens
@@ -119,22 +118,7 @@ def predict(
     for name in objective.counted:
         parts = {part: of_curves[name] for part, of_curves in halves.items() if name in of_curves}
         bands[name] = _curve(problem, name, simulated.curves[name], drawn, source, parts)
-    changing, count = population.scattering, population.fewest
-    later, few = measurement.last_cycle or measurement.cycle, max(3, min(len(changing), FEW_TESTS))
-    told: dict[str, Any] = {"source": source, "test": measurement.name, "rate": rate}
-    told |= {"outside": outside, "drive": objective.drive, "doubts": _doubts(problem)}
-    told |= {"nearest": not np.array_equal(springs, population.point), "held": population.held}
-    told |= {"scattering": changing, "few": count if changing and count < few else None}
-    told |= {"drawn": len(values) if changing else draws, "draws": draws}
-    told |= {"again": source.sha256 == measurement.data_sha256 and later > 1}
-    told |= {"curves": bands.values(), "trends": population.trends}
-    told["untold"] = [one.channel for one in bands.values() if one.channel not in source.misses]
-    told["missed"] = [one for one in bands.values() if one.inside < LEAST_INSIDE]
-    told["aligned"] = [
-        f"{NUISANCE[name].what} {engineering(value, unit_of(name))}"
-        for name, value in aligned.items()
-    ]
-    return Prediction(
+    found = Prediction(
         source=source.name,
         joint=source.joint,
         measurement=problem.measurement,
@@ -151,10 +135,19 @@ def predict(
         draws=len(values),
         redrawn=redrawn,
         held=population.held,
-        sentences=render.sentences("predicted_sentences", **told),
-        warnings=render.sentences("predicted_warnings", **told),
         aligned=aligned,
     )
+    same = source.sha256 == measurement.data_sha256
+    later = measurement.last_cycle or measurement.cycle
+    enough = max(3, min(len(population.scattering), FEW_TESTS))
+    nearest = not np.array_equal(springs, population.point)
+    told: dict[str, Any] = {"found": found, "source": source, "population": population}
+    told |= {"outside": outside, "doubts": _doubts(problem), "nearest": nearest, "enough": enough}
+    told |= {"draws": draws, "again": same and later > 1, "least": LEAST_INSIDE}
+    told |= {"nuisance": NUISANCE, "unit_of": unit_of}
+    said, warned = (f"predicted_{kind}" for kind in ("sentences", "warnings"))
+    sentences, warnings = render.sentences(said, **told), render.sentences(warned, **told)
+    return replace(found, sentences=sentences, warnings=warnings)
 
 
 def _outside(source: Source, rate: float | None) -> str | None:

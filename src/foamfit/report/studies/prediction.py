@@ -110,12 +110,12 @@ class Prediction(Result, OfLaw):
     draws: int  #: Number of specimens drawn
     redrawn: int  #: Number of further specimens, which were not admissible and were replaced
     held: tuple[str, ...]  #: Parameters fixed at their values because they are not determined
-    sentences: tuple[str, ...]
-    warnings: tuple[str, ...]
     #: Unknowns of the record (contact time, zeros, striker, time shift), fitted to it with the
     #: predicted springs; parameters that vary between specimens are free in this fit. Values count
     #: from the origins of the file.
     aligned: dict[str, float] = field(default_factory=dict)
+    sentences: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     _kind = "prediction.json"
 
