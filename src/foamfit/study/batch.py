@@ -400,11 +400,4 @@ def _results(task: Task) -> tuple[tuple[Row, ...], Callable[[Path], None]]:
         return (row_of(task.name, file, result),), partial(write_result, result, **pictures)
     numbers = recipe.cycles or None
     fits = fit_cycles(path, task.toml, cycles=numbers, model=recipe.model, **recipe.options)
-    rows = list[Row]()
-    for number in sorted({*fits.results, *fits.refused}):
-        name = f"{task.name}/cycle-{number}"
-        if number in fits.results:
-            rows.append(row_of(name, file, fits.results[number]))
-        else:
-            rows.append(Row(name, file, REFUSED, " ".join(fits.refused[number].split())))
-    return tuple(rows), partial(fits.write, **pictures)
+    return fits.listed(task.name, file), partial(fits.write, **pictures)

@@ -18,12 +18,12 @@ from foamfit.options import Keywords
 from foamfit.parts import ParameterEstimate
 from foamfit.report import figures
 from foamfit.report.folder import Result, brief, write_json, write_result, write_table, write_text
+from foamfit.report.listing import REFUSED, Row, row_of, table_rows
 from foamfit.report.plots import draw_loops
 from foamfit.report.readable import own_name
 from foamfit.report.render import words
 from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
-from foamfit.report.summary import CURVES
-from foamfit.report.tables import by_test, by_test_tex, frame, stacked, varied, wide
+from foamfit.report.tables import by_test, by_test_tex, frame, stacked, varied
 from foamfit.results import Fit, stamp
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, percent
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ENERGY = "dissipated_energy"
+FEATURES = ("start_strain", "peak_strain", "peak_stress", ENERGY)  # columns of cycles.csv
 MOST_NAMES = 12  # more parameters than this are not printed; all are in cycles.csv
 # Panels next to the parameters: columns of cycles.csv (SI), and their factors.
 BY_CYCLE = {
@@ -63,24 +64,31 @@ class CycleFits(Result):
         every = varied([one.parameters for _, one in sorted(self.results.items())])
         return {name: each for name, each in every.items() if name not in NUISANCE}
 
+    def listed(self, test: str, file: str) -> tuple[Row, ...]:
+        """Return a row of a table of fits for each cycle."""
+        return tuple(
+            row_of(f"{test}/cycle-{n}", file, self.results[n])
+            if n in self.results
+            else Row(f"{test}/cycle-{n}", file, REFUSED, " ".join(self.refused[n].split()))
+            for n in sorted({*self.results, *self.refused})
+        )
+
     def rows(self) -> Iterator[dict[str, Any]]:
         """Yield the rows of cycles.csv in SI, one per cycle; None for missing values."""
-        every = {n: self.results.get(n) for n in sorted({*self.results, *self.refused})}
-        parameters = wide([one.parameters if one else {} for one in every.values()])
-        misfits = (f"misfit_{name}" for name in CURVES)
-        names = ["start_strain", "peak_strain", "peak_stress", ENERGY, *misfits]
-        for (number, one), own in zip(every.items(), parameters, strict=True):
-            cells: list[Any] = [None] * len(names)
-            status = "refused"
-            if one is not None:
-                m, status = one.measurement, one.status
-                moved, height = m.displacement, m.specimen.height
-                strain = None if moved is None else moved.max() / height
-                stress = None if m.stress is None else m.stress.max()
-                cells = [m.start_strain, strain, stress, one.energy.get(ENERGY)]
-                cells += map(one.misfit.get, CURVES)
-            row = {"cycle": number, **dict(zip(names, plain(cells), strict=True))}
-            yield row | {"status": status, "error": self.refused.get(number), **own}
+        numbers = sorted({*self.results, *self.refused})
+        for number, row in zip(numbers, table_rows(self.listed(self.test, "")), strict=True):
+            own: dict[str, Any] = dict.fromkeys(
+                ("start_strain", "peak_strain", "peak_stress", ENERGY)
+            )
+            if (one := self.results.get(number)) is not None:
+                m, height = one.measurement, one.measurement.specimen.height
+                own |= {"start_strain": m.start_strain, ENERGY: one.energy.get(ENERGY)}
+                if m.displacement is not None:
+                    own["peak_strain"] = m.displacement.max() / height
+                if m.stress is not None:
+                    own["peak_stress"] = m.stress.max()
+            del row["test"], row["file"]
+            yield {"cycle": number, **plain(own), **row}
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of cycles.json, in plain types."""
