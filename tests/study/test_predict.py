@@ -1,6 +1,5 @@
 """Prediction of an unseen test: its curve, its band, and the refusals."""
 
-import copy
 import json
 import re
 from dataclasses import replace
@@ -176,25 +175,6 @@ def test_the_band_holds_new_specimens(make):
         found = ff.predict(make(values[:-1]), loop(seed=group, sigma_plus=values[-1]), draws=DRAWS)
         shares.append(found.inside["stress_strain"])
     assert 0.90 < np.mean(shares) < 0.99
-
-
-def test_own_values_that_change_with_the_rate_are_taken_at_that_of_the_test():
-    rng = np.random.default_rng(2)
-    rates = np.array([0.025, 0.025, 0.025, 1.0, 1.0, 1.0, 1.0, 1.0])
-    values = 1.1e5 * (rates / 0.25) ** 0.3 * np.exp(0.1 * rng.standard_normal(8))
-    content = own(values).content
-    found = {}
-    for name, at in (("rising", rates), ("unknown", [None] * 8)):
-        made = copy.deepcopy(content)
-        for test, rate in zip(made["tests"].values(), at, strict=True):
-            test["rate"] = None if rate is None else float(rate)
-        found[name] = ff.predict(in_memory(made), loop(rate=0.25, seed=0), draws=200)
-    rising, unknown = (found[name].parameters["s1_sigma_plus"] for name in ("rising", "unknown"))
-    assert rising.value == pytest.approx(1.1e5, rel=0.1)
-    assert unknown.value == pytest.approx(np.median(values))
-    known, other = (np.log(one.ci95[1] / one.ci95[0]) for one in (rising, unknown))
-    assert known < 0.5 * other
-    assert any("change" in one for one in found["rising"].sentences)
 
 
 def scattering(n=5, **more):

@@ -46,7 +46,7 @@ class Source:
     drive: str | None  # None if the tests of a joint fit have different drives
     interior_mass: bool
     status: str
-    rate_of: dict[str, float | None]  # Of the fitted tests, 1/s; None if unknown
+    rates: tuple[float, ...]  # Known ones of the fitted tests, 1/s
     rate0: float | None
     parameters: dict[str, ParameterEstimate]  # Of the springs
     errors: dict[str, float]  # Standard errors, also of parameters that are not determined
@@ -63,11 +63,6 @@ class Source:
     # The number of the last fitted cycle, and `Fit.growth` of several fitted as one history.
     last_cycle: float | None
     growth: float
-
-    @property
-    def rates(self) -> tuple[float, ...]:
-        """Known rates of the fitted tests, 1/s."""
-        return tuple(rate for rate in self.rate_of.values() if rate)
 
     def law_error(self, channel: str, noise: float) -> float:
         """Return half the 95 % band due to model error, relative to the measured range.
@@ -112,7 +107,7 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
     joint, drive, model = "tests" in content, content.get("drive"), Model.of_result(content)
     if drive not in (*DRIVES, None) or (drive is None and not joint):
         raise ValueError(f"drive is {drive!r}, not one of {', '.join(DRIVES)}")
-    tests = content["tests"] if joint else {"": content}
+    tests = list(content["tests"].values()) if joint else [content]
     data, noise = content.get("data") or {}, content.get("noise") or {}
     parameters = dict(_parameters(content["parameters"], model, joint))
     local = content.get("correlation") or {}
@@ -129,13 +124,13 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
         drive=drive,
         interior_mass=bool(content.get("interior_mass", False)),
         status=str(content.get("status")),
-        rate_of={name: (test if joint else data).get("rate") for name, test in tests.items()},
+        rates=tuple(rate for test in tests if (rate := (test if joint else data).get("rate"))),
         rate0=content.get("rate0"),
         parameters=parameters,
         errors={name: error for name, error in errors.items() if error},
         names=names,
         correlation=correlation,
-        misses=_misses(list(tests.values())),
+        misses=_misses(tests),
         time_shift=TIME_SHIFT in content["parameters"],
         changing=changing,
         together=together,

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from foamfit.arrays import Array, Mask
+from foamfit.arrays import Array
 from foamfit.data.measurement import Specimen
 from foamfit.errors import InputError
 from foamfit.fitting.box import is_logarithmic
@@ -22,12 +22,6 @@ from foamfit.fitting.links import RATES, factor
 from foamfit.parts import Pair, ParameterEstimate
 from foamfit.springs.parameters import split_name
 from foamfit.study.identified import NORMAL, Source
-from foamfit.trust.scatter import correlation
-
-# An own parameter has a trend with the rate if these conditions are met.
-EVIDENCE = 2.0  # least decrease of BIC
-FEWEST_OF_TREND = 5  # least number of tests
-SAME_RATE = 0.05  # least standard deviation of ln(rate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +125,7 @@ class Population:
             one = self._parameters[name.removesuffix(":b")]
             at = (one.b or 0.0) if name.endswith(":b") else one.value
             step = 1e-4 * self._error(name)
-            sides = [self._vector(self._means | {name: at + sign * step}) for sign in (-1.0, 1.0)]
+            sides = [self._vector({name: at + sign * step}) for sign in (-1.0, 1.0)]
             column[:] = (sides[1] - sides[0]) / (2.0 * step)
         return slopes @ matrix @ slopes.T
 
@@ -162,15 +156,10 @@ class Population:
     @cached_property
     def _correlation(self) -> Array:
         """Correlation of the scattering parameters between specimens."""
-        names, own = self.scattering, self._own
+        names = self.scattering
         out = np.eye(len(names))
         _, at, places = np.intersect1d(names, self.source.changing, return_indices=True)
         out[np.ix_(at, at)] = self.source.together[np.ix_(places, places)]
-        # For own parameters with a trend, or missing in the result, from their deviations.
-        if own.trend.any() or not set(own.names) <= set(self.source.changing):
-            _, at, places = np.intersect1d(names, own.names, return_indices=True)
-            among_own = correlation(own.deviations, np.zeros((places.size, places.size)))
-            out[np.ix_(at, at)] = among_own[np.ix_(places, places)]
         return out
 
     @property
@@ -183,34 +172,16 @@ class Population:
         """Own parameters of the tests, as logarithms where `_in_logarithms` holds."""
         names = tuple(name for name in self.scattering if self._parameters[name].kind == "own")
         if not names:
-            return _Own((), np.empty(0), np.empty(0, dtype=bool), np.empty((0, 0)), np.empty(0))
+            return _Own((), np.empty(0), np.empty((0, 0)), np.empty(0))
         if len({tuple(self._parameters[name].tests or ()) for name in names}) > 1:
             why = f"{self.source.where}: all own parameters must have values for the same tests"
             raise InputError(why)
         values = np.array([self._tests(name) for name in names]).T
         logs = [self._in_logarithms(name) for name in names]
         values[:, logs] = np.log(values[:, logs])
-        n, k = values.shape
-        mean, deviations = values.mean(axis=0), values - values.mean(axis=0)
-        trend, leverage = np.zeros(k, dtype=bool), np.full(k, 1.0 / n)
-        tests = self._parameters[names[0]].tests or {}
-        rates = [rate for test in tests if (rate := self.source.rate_of.get(test))]
-        x = np.log(rates) - math.log(self.rate or 1.0)
-        if self.rate and len(rates) == n >= FEWEST_OF_TREND and np.std(x) > SAME_RATE:
-            slope, there = np.polyfit(x, values, 1)
-            about = values - there - np.outer(x, slope)
-            squares = np.maximum([np.sum(deviations**2, axis=0), np.sum(about**2, axis=0)], 1e-300)
-            trend = n * np.log(squares[0] / squares[1]) - math.log(n) > EVIDENCE
-            mean, deviations = np.where(trend, there, mean), np.where(trend, about, deviations)
-            leverage = leverage + trend * x.mean() ** 2 / (n * np.var(x))
-        freedom = max(n - 1 - bool(trend.any()), 1)
-        spread = np.sqrt((1.0 + leverage) * np.sum(deviations**2, axis=0) / freedom)
-        return _Own(names, mean, trend, deviations, spread)
-
-    @property
-    def trends(self) -> list[str]:
-        """Own parameters that have a trend with the rate."""
-        return [name for name, x in zip(self._own.names, self._own.trend, strict=True) if x]
+        n, deviations = len(values), values - values.mean(axis=0)
+        spread = np.sqrt((1.0 + 1.0 / n) * np.sum(deviations**2, axis=0) / max(n - 1, 1))
+        return _Own(names, values.mean(axis=0), deviations, spread)
 
     def _in_logarithms(self, name: str) -> bool:
         return is_logarithmic(split_name(name)[1]) and min(self._tests(name)) > 0.0
@@ -221,15 +192,9 @@ class Population:
         return {name: _exp(u) if self._in_logarithms(name) else u for name, u in pairs}
 
     @property
-    def _means(self) -> dict[str, float]:
-        """Values at the rate of the test of own parameters with a trend."""
-        means = self._own_values(self._own.mean)
-        return {name: means[name] for name in self.trends}
-
-    @property
     def point(self) -> Array:
         """The common values, at the rate of the test."""
-        return self._vector(self._means)
+        return self._vector({})
 
     def candidates(self) -> Iterator[Array]:
         """Yield the common values, then those with the own values of each test, nearest first."""
@@ -247,7 +212,7 @@ class Population:
         """
         rng, other = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
         scatter, uncertain = _root(self._correlation), _root(self.covariance)
-        own, freedom = self._own, max(self.fewest - 1 - bool(self._own.trend.any()), 1)
+        own, freedom = self._own, max(self.fewest - 1, 1)
         while True:
             tail = math.sqrt(freedom / rng.chisquare(freedom))
             drawn = tail * (scatter @ rng.standard_normal(len(self.scattering)))
@@ -284,15 +249,10 @@ class Population:
 
 
 class _Own(NamedTuple):
-    """k own parameters of n tests, as a sample of specimens.
-
-    If there is evidence for a trend with the rate, the mean of a parameter is a straight line over
-    the logarithm of the rate.
-    """
+    """k own parameters of n tests, as a sample of specimens."""
 
     names: tuple[str, ...]
-    mean: Array  # (k,): at the rate of the test that is predicted
-    trend: Mask  # (k,): whether there is evidence for a trend
+    mean: Array  # (k,)
     deviations: Array  # (n, k): of the tests from the means
     spread: Array  # (k,): standard deviation of a new specimen from the mean, as estimated
 
