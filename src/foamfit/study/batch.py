@@ -219,10 +219,8 @@ def batch(
         If the call is wrong, or a result cannot be written (full disk).
     """
     numbers = () if cycle == "all" else cycle
-    if isinstance(numbers, int | np.integer):
-        numbers = int(numbers)
-    elif numbers is not None:
-        numbers = tuple(map(int, numbers))
+    if numbers is not None:
+        numbers = tuple(map(int, numbers)) if np.iterable(numbers) else int(numbers)
     chosen = Options.of("batch", options)
     named = _checked(model, chosen)
     recipe = Recipe(named, vars(chosen), numbers, report, figure_width, history=cycles)

@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -83,9 +82,6 @@ class Population:
             inverse = np.linalg.pinv(r[np.ix_(held, held)], hermitian=True)
             inner = inner - across @ inverse @ across.T
         matrix[np.ix_(at, at)] = inner
-        # Their common values
-        _, at, places = np.intersect1d(free, self.scattering, return_indices=True)
-        matrix[np.ix_(at, at)] = self._correlation[np.ix_(places, places)]
         errors = np.array([self._error(name) for name in free])
         matrix = matrix * np.outer(errors, errors)
         flat = [self._flat(n, self.limits[n]) if n in self.limits else math.inf for n in free]
@@ -168,28 +164,19 @@ class Population:
         return min((len(self._tests(name)) for name in self.scattering), default=0)
 
     @cached_property
-    def _own(self) -> _Own:
-        """Own parameters of the tests, as logarithms where `_in_logarithms` holds."""
-        names = tuple(name for name in self.scattering if self._parameters[name].kind == "own")
-        if not names:
-            return _Own((), np.empty(0), np.empty((0, 0)), np.empty(0))
-        if len({tuple(self._parameters[name].tests or ()) for name in names}) > 1:
-            why = f"{self.source.where}: all own parameters must have values for the same tests"
-            raise InputError(why)
-        values = np.array([self._tests(name) for name in names]).T
-        logs = [self._in_logarithms(name) for name in names]
-        values[:, logs] = np.log(values[:, logs])
-        n, deviations = len(values), values - values.mean(axis=0)
-        spread = np.sqrt((1.0 + 1.0 / n) * np.sum(deviations**2, axis=0) / max(n - 1, 1))
-        return _Own(names, values.mean(axis=0), deviations, spread)
-
-    def _in_logarithms(self, name: str) -> bool:
-        return is_logarithmic(split_name(name)[1]) and min(self._tests(name)) > 0.0
-
-    def _own_values(self, logarithms: Array) -> dict[str, float]:
-        """Return own parameters, SI, given their logarithms where `_in_logarithms` holds."""
-        pairs = zip(self._own.names, logarithms.tolist(), strict=True)
-        return {name: _exp(u) if self._in_logarithms(name) else u for name, u in pairs}
+    def _varying(self) -> dict[str, tuple[float, float, bool]]:
+        """Mean and standard deviation over specimens, as estimated; whether of the logarithm."""
+        out = dict[str, tuple[float, float, bool]]()
+        for name in self.scattering:
+            one, values = self._parameters[name], np.array(self._tests(name))
+            logs = is_logarithmic(split_name(name)[1]) and bool(np.min(values) > 0.0)
+            if one.kind == "scatter":
+                out[name] = math.log(abs(one.value)), one.scatter or 0.0, True
+            else:
+                each = np.log(values) if logs else values
+                spread = math.sqrt((1.0 + 1.0 / each.size) * np.var(each, ddof=1))
+                out[name] = float(each.mean()), spread, logs
+        return out
 
     @property
     def point(self) -> Array:
@@ -199,10 +186,13 @@ class Population:
     def candidates(self) -> Iterator[Array]:
         """Yield the common values, then those with the own values of each test, nearest first."""
         yield self.point
-        own = self._own
-        scale = np.maximum(np.sqrt(np.sum(own.deviations**2, axis=0)), 1e-300)
-        for row in own.deviations[np.argsort(np.sum((own.deviations / scale) ** 2, axis=1))]:
-            yield self._vector(self._own_values(own.mean + row))
+        own = [name for name in self.scattering if self._parameters[name].kind == "own"]
+        rows = np.array([self._tests(name) for name in own]).T
+        if not own:
+            return
+        off = (rows - rows.mean(axis=0)) / rows.std(axis=0)
+        for row in rows[np.argsort(np.sum(off**2, axis=1))]:
+            yield self._vector(dict(zip(own, row.tolist(), strict=True)))
 
     def draws(self, seed: int) -> Iterator[Array]:
         """Draw parameters of specimens, from their scatter and the uncertainty of the result.
@@ -212,15 +202,15 @@ class Population:
         """
         rng, other = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
         scatter, uncertain = _root(self._correlation), _root(self.covariance)
-        own, freedom = self._own, max(self.fewest - 1, 1)
+        freedom = max(self.fewest - 1, 1)
         while True:
             tail = math.sqrt(freedom / rng.chisquare(freedom))
             drawn = tail * (scatter @ rng.standard_normal(len(self.scattering)))
-            deviates = dict(zip(self.scattering, drawn.tolist(), strict=True))
-            values = self._own_values(own.mean + own.spread * [deviates[n] for n in own.names])
-            for name in deviates.keys() - values.keys():
-                one = self._parameters[name]
-                values[name] = one.value * _exp((one.scatter or 0.0) * deviates[name])
+            values = dict[str, float]()
+            for (name, (mean, spread, logs)), x in zip(self._varying.items(), drawn, strict=True):
+                number = mean + spread * float(x)
+                size = math.exp(min(max(number, -700.0), 700.0))  # finite; none may be that large
+                values[name] = math.copysign(size, self._parameters[name].value) if logs else number
             yield self._vector(values) + uncertain @ other.standard_normal(len(self._parameters))
 
     def _vector(self, changes: Mapping[str, float]) -> Array:
@@ -248,21 +238,7 @@ class Population:
         return np.array(list(values.values()))
 
 
-class _Own(NamedTuple):
-    """k own parameters of n tests, as a sample of specimens."""
-
-    names: tuple[str, ...]
-    mean: Array  # (k,)
-    deviations: Array  # (n, k): of the tests from the means
-    spread: Array  # (k,): standard deviation of a new specimen from the mean, as estimated
-
-
 def _root(correlation: Array) -> Array:
     """Return a matrix square root of a covariance; negative eigenvalues count as zero."""
     power, axes = np.linalg.eigh(correlation)
     return np.asarray(axes * np.sqrt(np.maximum(power, 0.0)))
-
-
-def _exp(value: float) -> float:
-    """Return the exponential, clipped to a finite value; no parameter may be that large."""
-    return math.exp(min(max(value, -700.0), 700.0))
