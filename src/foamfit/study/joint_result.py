@@ -15,7 +15,6 @@ from foamfit.api import FitResult
 from foamfit.arrays import Array
 from foamfit.codec import plain
 from foamfit.data.measurement import ASKED
-from foamfit.data.zeros import CONTRADICTED
 from foamfit.fitting.links import RATES
 from foamfit.fitting.search import SearchRecord
 from foamfit.fitting.together import Together
@@ -364,18 +363,17 @@ def _with_words(
     result: JointResult, fit: JointFit, alone: Together, open_slopes: Mapping[str, float]
 ) -> JointResult:
     """Return a joint fit with its status, warnings and sentences."""
-    lost, large, wrong, missed = list[str](), list[Any](), list[Any](), list[float]()
-    doubts = dict[str, list[str]]()  # tests by their notes about probable errors in the input
+    lost, large, missed = list[str](), list[Any](), list[float]()
+    doubts = dict[str, list[str]]()  # tests by their warnings about probable errors in the input
     every = zip(result.tests.items(), fit.point.bests, fit.point.errors, strict=True)
     for (test, one), best, errors in every:
         objective = best.problem.objective
         pairs = zip(objective.counted, errors, strict=True)
         shares = [error.law / objective.span(curve) for curve, error in pairs if error.found]
         missed += [max(shares)] if shares else []
-        for note in best.problem.measurement.notes:
-            if note.startswith(ASKED) and CONTRADICTED not in note:
-                doubts.setdefault(note.removeprefix(ASKED).strip(), []).append(test)
-        wrong += [(test, each, objective.drive) for each in best.contradictions]
+        for warning in result.results[test].warnings:
+            if warning.startswith(ASKED):
+                doubts.setdefault(warning.removeprefix(ASKED).strip(), []).append(test)
         followed = misfits_of(best, one.misfit)
         lost += [test] * any(curve["lost"] for curve in followed)
         large += [(test, curve["name"], curve["off"]) for curve in followed if curve["poor"]]
@@ -383,7 +381,7 @@ def _with_words(
     first, top = max(result.tests.items(), key=lambda pair: pair[1].chi2_share)
     slopes = [(name, result.parameters[name].kind, half) for name, half in open_slopes.items()]
     told: dict[str, Any] = {"result": result, "laws": RATES, "slopes": slopes, "lost": lost}
-    told |= {"large": large, "wrong": wrong, "doubts": doubts, "missed": missed}
+    told |= {"large": large, "doubts": doubts, "missed": missed}
     told |= {"rates": f"{min(rates):.3g} to {max(rates):.3g} 1/s" if rates else ""}
     told |= {"top": (first, top), "dominant": max(DOMINANT, MORE * top.n_data / fit.found.n_data)}
     told |= {"together": _span_of(fit.found.misfits), "alone": _span_of(alone.misfits)}
