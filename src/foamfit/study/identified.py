@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -25,14 +25,6 @@ from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, split_name
 
 NORMAL = 1.959964  # half the 95 % interval of a normal distribution, in standard deviations
-
-
-class Miss(NamedTuple):
-    """Residuals of a curve of a fitted test, relative to the measured range."""
-
-    misfit: float  # RMS
-    noise: float | None  # Standard deviation
-    most: float = 0.0  # 95 % quantile of the magnitude
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +45,7 @@ class Source:
     # Names of uncertain parameters and slopes of rate laws ("s1_k0:b"), and their correlation.
     names: tuple[str, ...]
     correlation: Array
-    misses: dict[str, list[Miss]]  # Of the fitted tests, by channel
+    law_errors: dict[str, float]  # By channel, see `_law_errors`
     time_shift: bool  # Whether a time shift of the motion was fitted
     # Names of own and scattering parameters, and their correlation between specimens, if known.
     changing: tuple[str, ...]
@@ -63,20 +55,6 @@ class Source:
     # The number of the last fitted cycle, and `Fit.growth` of several fitted as one history.
     last_cycle: float | None
     growth: float
-
-    def law_error(self, channel: str, noise: float) -> float:
-        """Return half the 95 % band due to model error, relative to the measured range.
-
-        It is the part of the residuals of the fitted tests that their noise does not explain. If
-        the result does not report this noise, `noise` (relative to the range) is used. Residuals
-        that are mostly small but sometimes large are measured by their 95 % quantile.
-        """
-        squares = []
-        for miss in self.misses.get(channel, ()):
-            sigma = noise if miss.noise is None else miss.noise
-            residual = max(NORMAL * miss.misfit, miss.most)
-            squares.append(max(residual**2 - (NORMAL * sigma) ** 2, 0.0))
-        return math.sqrt(sum(squares) / len(squares)) if squares else 0.0
 
 
 def read_source(result: Result | str | Path) -> Source:
@@ -130,7 +108,7 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
         errors={name: error for name, error in errors.items() if error},
         names=names,
         correlation=correlation,
-        misses=_misses(tests),
+        law_errors=_law_errors(tests),
         time_shift=TIME_SHIFT in content["parameters"],
         changing=changing,
         together=together,
@@ -203,17 +181,23 @@ def _correlation(
     return tuple(names[i] for i in kept), 0.5 * (matrix + matrix.T)
 
 
-def _misses(tests: list[Mapping[str, Any]]) -> dict[str, list[Miss]]:
-    """Return the residuals of the fitted curves of all tests, by channel."""
-    found = dict[str, list[Miss]]()
+def _law_errors(tests: list[Mapping[str, Any]]) -> dict[str, float]:
+    """Return half the 95 % band due to model error by channel, relative to the measured range.
+
+    It is the part of the residuals of the fitted curves that their noise does not explain, RMS over
+    the tests. Residuals that are mostly small but sometimes large are measured by their 95 %
+    quantile.
+    """
+    squares = dict[str, list[float]]()
     for test in tests:
         counted = test.get("noise") or {}  # its keys are the fitted curves
         for curve, misfit in (test.get("misfit") or {}).items():
             if misfit is None or (counted and curve not in counted):
                 continue
-            noise, share, most = counted.get(curve) or {}, None, 0.0
-            if span := noise.get("range"):
-                share, most = noise["sigma"] / span, (noise.get("residual_q95") or 0.0) / span
+            noise = counted.get(curve) or {}
+            span = noise.get("range") or math.inf  # the noise is not known
+            sigma, most = ((noise.get(key) or 0.0) / span for key in ("sigma", "residual_q95"))
             channel = "stress" if curve.startswith("stress") else curve.removesuffix("_time")
-            found.setdefault(channel, []).append(Miss(misfit, share, most))
-    return found
+            square = max(NORMAL * misfit, most) ** 2 - (NORMAL * sigma) ** 2
+            squares.setdefault(channel, []).append(max(square, 0.0))
+    return {channel: math.sqrt(sum(each) / len(each)) for channel, each in squares.items()}

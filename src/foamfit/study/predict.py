@@ -341,8 +341,8 @@ def _curve(
         parts["scatter"] = np.sqrt(np.maximum(both**2 - parts["parameters"] ** 2, 0.0))
     sigma, span = objective.noise(name).sigma, float(np.ptp(predicted))
     parts["noise"] = np.full(n, NORMAL * sigma)
-    law_error = source.law_error(channel, sigma / float(np.ptp(objective.measured[name])))
-    parts["law_error"] = law_error * span * np.sqrt(_growth(problem.measurement, source))
+    law_error = span * source.law_errors.get(channel, 0.0)
+    parts["law_error"] = law_error * np.sqrt(_growth(problem.measurement, source))
     contained = {"scatter", "parameters"} if drawn else {"scatter"}  # in the draws
     more = sum(parts[part] ** 2 for part in parts.keys() - contained)
     kept = np.zeros(n, dtype=bool)
