@@ -99,8 +99,8 @@ def fit_jointly(problems: Sequence[Problem], links: Links, starts: Sequence[Vect
             break
         found = fit_linked(problems, replace(links, pulls=pulls), [found.values])
         point = JointPoint(found, errors, inflations)
-    ranges = ranges_of(point)
-    own = own_ranges(point, ranges)
+    ranges, refits = ranges_of(point)
+    own = own_ranges(point, refits)
     minima = [] if scatter or point.uncertainty.errs else minima
     others = tuple(JointPoint(one, errors) for one in minima)
     return JointFit(point, spreads, ranges, own, correlation_of(point, undrawn), others)
@@ -174,51 +174,45 @@ def errors_of(found: Together) -> tuple[tuple[CurveError, ...], ...]:
     return tuple(best.judged(point.taken(t)) for t, best in enumerate(point.bests))
 
 
-def ranges_of(point: JointPoint) -> dict[str, Ends]:
+def ranges_of(point: JointPoint) -> tuple[dict[str, Ends], list[Together]]:
     """Return ranges of shared values and slopes of rate laws (":b") due to model error.
 
     A range is the hull of two: the 95 % interval of a value found from the same number of other
     specimens, from fits without each test in turn (a jackknife of n <= `GROUPS` groups, with
     Student's t of n - 1 degrees of freedom); and shared values that fit almost equally well
-    (`trust.ranges`). Empty if there is only noise.
+    (`trust.ranges`), with the fits at their ends. Empty if there is only noise.
     """
+    refits = list[Together]()
     if not point.uncertainty.errs:
-        return {}
+        return {}, refits
     out = _over_specimens(point.found)
     for name in point.found.shared:
         if point.found.links.kind(name) == "shared":
-            held = (_held(point, name, sign) for sign in (-1.0, 1.0))
-            ends = [*held, point.found.common[name][0], *out.get(name, ())]
             one = next(best for best in point.bests if name in best.problem.free())
+            held = [fit for sign in (-1.0, 1.0) if (fit := _held(point, name, sign))]
+            every = [values[one.index[name]] for fit in held for values in fit.values]
+            ends = [*every, point.found.common[name][0], *out.get(name, ())]
             low, high = np.clip([min(ends), max(ends)], *one.limits(name)).tolist()
-            out[name] = low, high
-    return out
+            out[name], refits = (low, high), refits + held
+    return out, refits
 
 
-def own_ranges(point: JointPoint, ranges: Mapping[str, Ends]) -> tuple[dict[str, Ends], ...]:
+def own_ranges(point: JointPoint, refits: Sequence[Together]) -> tuple[dict[str, Ends], ...]:
     """Return the ranges due to model error of the values that each test has for itself.
 
-    A range is the hull of two: values that fit the test almost equally well while the shared values
-    stay where they are (`trust.ranges`); and what the ends of the range of each shared value make
-    of it, to first order.
+    A range is the hull of values that fit the test almost equally well while the shared values stay
+    where they are (`trust.ranges`), and of those in the `refits` with other shared values.
     """
     out = []
-    for best in point.bests:
-        problem, values = best.problem, best.values
-        shared = [name for name in best.names if name in point.found.shared]
-        for name in shared:
+    for t, best in enumerate(point.bests):
+        problem = best.problem
+        for name in (name for name in best.names if name in point.found.shared):
             problem = problem.holding(name, best.value(name))
-        alone = BestPoint(problem, values)
+        alone = BestPoint(problem, best.values)
         found = left_open(alone, (), Tracker(problem.objective), descents=False).ranges
-        moves = np.linalg.pinv(alone.scaled, rcond=1e-10) @ problem.slopes(values, tuple(shared))
-        for name, column in zip(shared if found else (), moves.T, strict=False):
-            common, value = point.found.common[name][0], best.value(name)
-            for end in ranges.get(name, ()):
-                change = (end - common) * (value / common if common else 1.0)
-                steps = -alone.sizes * column * change
-                moved = np.clip(values[alone.places] + steps, *alone.box).tolist()
-                pairs = zip(alone.names, moved, strict=True)
-                found |= {n: (min(found[n][0], x), max(found[n][1], x)) for n, x in pairs}
+        for name, ends in found.items():
+            each = [*ends, *(float(one.values[t][best.index[name]]) for one in refits)]
+            found[name] = min(each), max(each)
         out.append(found)
     return tuple(out)
 
@@ -255,8 +249,8 @@ def _without(found: Together, kept: list[int]) -> Mapping[str, tuple[float, ...]
         return None
 
 
-def _held(point: JointPoint, name: str, sign: float) -> float:
-    """Return the farthest shared value that fits almost equally well, found in a few refits."""
+def _held(point: JointPoint, name: str, sign: float) -> Together | None:
+    """Return a fit with the farthest shared value that fits almost equally well; None if none."""
     found, (value,) = point.found, point.found.common[name]
     rise = sum(map(tolerance, point.bests, point.errors))
     low, high = next(best for best in point.bests if name in best.problem.free()).limits(name)
@@ -268,14 +262,14 @@ def _held(point: JointPoint, name: str, sign: float) -> float:
         start = point.moved(name, end - value)
         problems = [problem.holding(name, end) for problem in found.problems]
         try:
-            cost = fit_linked(problems, found.links, [start], iterations=ITERATIONS).cost
+            other = fit_linked(problems, found.links, [start], iterations=ITERATIONS)
         except SimulationError:
             change *= 0.5
             continue
-        if cost - found.cost <= rise:
-            return end
-        change = abs(end - value) * nearer(rise, cost - found.cost)
-    return value
+        if other.cost - found.cost <= rise:
+            return other
+        change = abs(end - value) * nearer(rise, other.cost - found.cost)
+    return None
 
 
 def parameters_of(fit: JointFit, tests: tuple[str, ...]) -> dict[str, ParameterEstimate]:
