@@ -77,16 +77,12 @@ class CycleFits(Result):
         """Yield the rows of cycles.csv in SI, one per cycle; None for missing values."""
         numbers = sorted({*self.results, *self.refused})
         for number, row in zip(numbers, table_rows(self.listed(self.test, "")), strict=True):
-            own: dict[str, Any] = dict.fromkeys(
-                ("start_strain", "peak_strain", "peak_stress", ENERGY)
-            )
+            own: dict[str, Any] = dict.fromkeys(FEATURES)
             if (one := self.results.get(number)) is not None:
-                m, height = one.measurement, one.measurement.specimen.height
+                m = one.measurement
                 own |= {"start_strain": m.start_strain, ENERGY: one.energy.get(ENERGY)}
-                if m.displacement is not None:
-                    own["peak_strain"] = m.displacement.max() / height
-                if m.stress is not None:
-                    own["peak_stress"] = m.stress.max()
+                tops = ("strain", m.displacement, m.specimen.height), ("stress", m.stress, 1.0)
+                own |= {f"peak_{name}": x.max() / by for name, x, by in tops if x is not None}
             del row["test"], row["file"]
             yield {"cycle": number, **plain(own), **row}
 
