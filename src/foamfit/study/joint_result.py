@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _NOT_IN_FILE = ("results", "fit")  # fields that joint.json does not contain
+_INPUT = ("velocity", "impulse", "input")  # those about the record, contradictions first
 _OF_A_SEARCH = ("ended", "agree")  # items of the checklist that apply only to a search
 # More than this share of χ², and this multiple of its share of samples, make a test dominant.
 DOMINANT, MORE = 0.5, 2.0
@@ -371,12 +372,14 @@ def _with_words(
         pairs = zip(objective.counted, errors, strict=True)
         shares = [error.law / objective.span(curve) for curve, error in pairs if error.found]
         missed += [max(shares)] if shares else []
-        for warning in result.results[test].warnings:
-            if warning.startswith(ASKED):
-                doubts.setdefault(warning.removeprefix(ASKED).strip(), []).append(test)
         followed = misfits_of(best, one.misfit)
         lost += [test] * any(curve["lost"] for curve in followed)
         large += [(test, curve["name"], curve["off"]) for curve in followed if curve["poor"]]
+    fits = result.results.items()
+    checks = [(check, test) for test, fit in fits for check in fit.checklist if check.key in _INPUT]
+    for check, test in sorted(checks, key=lambda pair: _INPUT.index(pair[0].key)):
+        for warning in check.warnings:
+            doubts.setdefault(warning.removeprefix(ASKED).strip(), []).append(test)
     rates = [rate for rate in result.rates if rate is not None]
     first, top = max(result.tests.items(), key=lambda pair: pair[1].chi2_share)
     slopes = [(name, result.parameters[name].kind, half) for name, half in open_slopes.items()]
