@@ -171,9 +171,6 @@ def find_table(text: Text, names: set[str | int]) -> Table:
     if len(above) >= MIN_ROWS:
         wrong = f"rows {above[0]} to {above[-1]} contain numbers above the header in row {row}"
         raise InputError(f"{wrong}; {_ONE}.")
-    if (longest := max(map(len, grid[i]))) > LONGEST:
-        most = f"{longest} characters; it must have {LONGEST} at most"
-        raise InputError(f"row {row}: the name of a column has {most}.")
     first, texts = _unit_row(grid, i)
     body = [cells for cells in grid[first:] if any(cells)]
     if not body:
@@ -245,7 +242,6 @@ def _score(cells: list[str], names: set[str]) -> int:
 
 
 def _is_number(cell: str) -> bool:
-    cell = cell.strip()
     return bool(_NUMBER.fullmatch(cell.replace(",", ".")) or _CLOCK.fullmatch(cell))
 
 
@@ -323,13 +319,8 @@ def read_numbers(
     Times like 12:00:00.5 are converted to seconds. InputError names the first cell that is not a
     number.
     """
-    places, dropped = list(columns.values()), list[Dropped]()
-    read = _plain_numbers(table, places)
-    if read is None:
-        read, rows, dropped = _checked_numbers(table, columns)
-    else:
-        rows = np.arange(table.first_row + 1, table.first_row + 1 + read.shape[1])
-    for k, values in zip(places, read, strict=True):
+    read, rows, dropped = _rows_of_numbers(table, columns)
+    for k, values in zip(columns.values(), read, strict=True):
         _refuse_thousands(table, k, values)
         if table.clock is not None and k == 0:
             values[:] = table.clock[0] + table.clock[1] * values
@@ -337,25 +328,6 @@ def read_numbers(
         time = read[[*columns].index("time")]
         time[:] = np.unwrap(time, period=period)
     return dict(zip(columns, read, strict=True)), rows, dropped
-
-
-def _plain_numbers(table: Table, places: list[int]) -> Array | None:
-    """Read the columns (k, n) fast; None unless every row contains finite numbers."""
-    text = table.body().rstrip("\r\n")
-    comma = table.decimal == ","
-    if not text or (comma and ("." in text or table.separator == ",")):
-        return None
-    text = text.replace(",", ".") if comma else text
-    kinds = [(str(k), "f8" if k in places else "U1") for k in range(len(table.headers))]
-    try:
-        lines = io.StringIO(text, newline=None)
-        read = np.loadtxt(lines, kinds, None, table.separator, quotechar='"', ndmin=1)
-    except ValueError:
-        return None
-    numbers = np.array([read[str(k)] for k in places])
-    # A blank line, or a cell with line breaks, would shift the row numbers.
-    complete = read.size == text.count("\n") + 1 and np.isfinite(numbers).all()
-    return numbers if complete else None
 
 
 def _of_header(table: Table, row: int, cells: Sequence[str]) -> list[str]:
@@ -370,10 +342,10 @@ def _of_header(table: Table, row: int, cells: Sequence[str]) -> list[str]:
     return out
 
 
-def _checked_numbers(
+def _rows_of_numbers(
     table: Table, columns: dict[str, int]
 ) -> tuple[Array, Integers, list[Dropped]]:
-    """Read the columns (k, n) cell by cell; see `read_numbers`.
+    """Read the columns (k, n) row by row; see `read_numbers`.
 
     A row is dropped if it contains at most a time, or if it is a remark below the table. A remark
     may contain a number, as in "Max force,23,N".
@@ -381,7 +353,19 @@ def _checked_numbers(
     numbers, rows, empty, remarks = array("d"), array("q"), list[int](), list[int]()
     places, below = list(columns.values()), list[tuple[int, InputError]]()
     measured = [k for name, k in columns.items() if name != "time"] or places
+    body, width = table.body(), len(table.headers)
+    # Python reads 1_000, and digits of other scripts, as numbers.
+    usual = table.decimal == "." and body.isascii() and "_" not in body
     for row, cells in table.rows():
+        if usual and len(cells) == width and not below:
+            try:
+                values = [float(cells[k]) for k in places]
+            except ValueError:
+                values = [math.nan]
+            if math.isfinite(sum(values)):
+                numbers.extend(values)
+                rows.append(row)
+                continue
         cells = _of_header(table, row, cells)
         if all(cells[k].lower() in _MISSING for k in measured):
             filled = [cell for cell in cells if cell.lower() not in _MISSING]
