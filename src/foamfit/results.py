@@ -225,14 +225,14 @@ def stamp() -> dict[str, Any]:
 
 
 def loop_of(test: Measurement, along: Array | None, over_time: Array | None) -> Loop | None:
-    """Return the loop of a test against strain, or else against time; None without stress.
+    """Return the loop of a test against strain, or else against time; None without either.
 
     The fitted stress (Pa) is `along` in the first case and `over_time` in the second.
     """
-    if test.stress is not None and test.displacement is not None and along is not None:
+    if test.displacement is not None and along is not None:
         strain = test.displacement / test.specimen.height
         return Loop(test.name, strain, "strain", test.stress, along)
-    if test.stress is None or test.time is None:
+    if test.time is None:
         return None
     return Loop(test.name, test.time, "time (s)", test.stress, over_time)
 

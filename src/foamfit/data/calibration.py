@@ -149,7 +149,7 @@ def _of_force(test: Measurement, ratio: float, limit: float, mass: float) -> Con
 def balance(test: Measurement) -> Balance:
     """Return what the equation of motion of the striker shows in an impact."""
     striker, w, stress, time = test.striker, test.displacement, test.stress, test.time
-    if striker is None or w is None or stress is None or time is None:
+    if striker is None or w is None or time is None:
         return Balance()
     if not (striker.mass and striker.velocity) or test.motion == INTEGRATED:
         return Balance()

@@ -331,7 +331,7 @@ class Measurement(Samples):
     path: Path | None  #: None without a file
     data_sha256: str  #: digest of the file
     time: Array | None  #: s, increasing, (n,)
-    stress: Array | None  #: nominal base stress, Pa, (n,)
+    stress: Array  #: nominal base stress, Pa, (n,)
     displacement: Array | None  #: of the top, m, (n,)
     specimen: Specimen
     striker: Striker | None = None

@@ -279,7 +279,7 @@ def _completed(stated: dict[str, dict[str, Any]], test: Measurement, relaxing: b
         rate = 1.0 / float(np.median(np.diff(test.time)))
         assume(record, "rate", rate, f"{engineering(rate, 'Hz')} sampling")
     noise, small = record.setdefault("noise", {}), 1e-3 * test.specimen.height
-    usual = {"stress": small if test.stress is None else 0.01 * float(np.ptp(test.stress))}
+    usual = {"stress": 0.01 * float(np.ptp(test.stress))}
     for channel, unit in (("stress", "Pa"), ("displacement", "m")):
         level = test.noise.of(channel)
         sigma = level.sigma if level and level.sigma else usual.get(channel, small)

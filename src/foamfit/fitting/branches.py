@@ -94,7 +94,6 @@ def branch_of_samples(problem: Problem, simulated: Simulated) -> NDArray[np.str_
     For example "loading, spring 1 on d". Loading ends at the peak of the measured stress.
     """
     stress = problem.measurement.stress
-    assert stress is not None
     words = np.empty(problem.objective.time.size, dtype=object)
     for at, on in _states(problem, simulated):
         words[at:] = " and ".join(f"spring {i + 1} on {branch}" for i, branch in on.items())

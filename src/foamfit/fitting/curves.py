@@ -73,7 +73,6 @@ def check_drive(measurement: Measurement, drive: str) -> None:
         raise InputError(f"drive '{drive}' is unknown; it must be one of {', '.join(DRIVES)}")
     striker, impact = measurement.striker, drive == "impact"
     needed = {
-        "a force or stress column": measurement.stress is not None,
         "a time column": not impact or measurement.time is not None,
         "[striker] mass": not impact or (striker is not None and striker.mass is not None),
         "[striker] velocity greater than zero": not impact or (striker and striker.velocity),
@@ -146,7 +145,6 @@ def smooth_stress(measurement: Measurement, time: Array) -> SmoothMotion | None:
     The pulse of an impact has kinks that a spline takes for noise; see `driving_stress`.
     """
     stress, level = measurement.stress, measurement.noise.of("stress")
-    assert stress is not None  # checked by check_drive
     if measurement.striker is not None or level is None or level.sigma <= EXACT * np.ptp(stress):
         return None
     found = follow(time, stress, level, measurement.sampled.get("stress"))
@@ -164,7 +162,6 @@ def driving_stress(
     peak would cut it off. Chains with a unilateral spring carry no tension.
     """
     stress, begins = measurement.stress, (measurement.rise or (0.0, 0.0))[0]
-    assert stress is not None  # checked by check_drive
     if measurement.striker is not None:
         window, first = 2 * (stress.size // 50) + 1, int(np.searchsorted(time, begins))
         top = first + int(np.argmax(stress[first:]))
@@ -255,8 +252,6 @@ def is_glued(measurement: Measurement, *, leaves: bool) -> bool:
     glued only if the tension is more than `TENSION` of the peak.
     """
     stress, level = measurement.stress, measurement.noise.of("stress")
-    if stress is None:
-        return False
     several = measurement.last_cycle is not None  # the first peak need not be the highest
     lowest, width = lowest_mean(stress, 0 if several else int(np.argmax(stress)))
     noise = 0.0 if level is None else 4.0 * level.sigma / math.sqrt(width)

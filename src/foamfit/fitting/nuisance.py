@@ -148,7 +148,7 @@ def open_zero(measurement: Measurement, *, glued: bool) -> float:
     Its first stress may be an offset of the sensor, and so may a tension, unless it is `glued`.
     """
     stress = measurement.stress
-    if stress is None or measurement.contact != "file" or "stress" in measurement.zeros:
+    if measurement.contact != "file" or "stress" in measurement.zeros:
         return 0.0
     tension = 0.0 if glued else -lowest_mean(stress, int(np.argmax(stress)))[0]
     return max(float(stress[:_FIRST].mean()), tension, 0.0)

@@ -204,7 +204,6 @@ class Objective:
         """
         motion = self.motion if self.driven else None
         test = thinned(self.measurement, None if motion is None else motion.at(self.time))
-        assert test.stress is not None
         if test.stress.size > THIN * self.time.size:
             return self
         followed = (motion,) if self.driven else self.followed
@@ -284,9 +283,9 @@ class Objective:
         if test.displacement is not None:
             measured |= {"displacement_time": test.displacement, "stress_strain": test.stress}
         measured |= {name: test.interior[node] for name, node in self.interior.items()}
-        measured |= {ACCELERATION: test.acceleration} if self._accelerated else {}
-        present = self.scenes.present
-        return {n: curve for n, curve in measured.items() if n in present and curve is not None}
+        if self._accelerated and test.acceleration is not None:
+            measured[ACCELERATION] = test.acceleration
+        return {n: curve for n, curve in measured.items() if n in self.scenes.present}
 
     def noise(self, name: str) -> NoiseLevel:
         """Return the noise of a curve, stated or estimated."""

@@ -42,7 +42,6 @@ def thinned(
     and begins at the contact.
     """
     motion, stress, time = measurement.displacement, measurement.stress, measurement.time
-    assert stress is not None
     if followed is not None:
         motion = followed
     elif loop and motion is not None:
@@ -85,7 +84,6 @@ class Reading:
         """Motion (m) and stress (Pa) of the first cycle, without the delay of the motion."""
         space, loop = self.space, self.loop
         assert loop.displacement is not None
-        assert loop.stress is not None
         once, motion = next(iter(cycles_of(loop).values()), slice(None)), loop.displacement
         at = {name: float(value) for name, value in zip(space.names, space.values, strict=True)}
         if late := at.get(TIME_SHIFT, 0.0):

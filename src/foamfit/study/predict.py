@@ -361,7 +361,6 @@ def _curve(
 
 def _growth(measurement: Measurement, source: Source) -> Array:
     """Return the mean square of the model error over its value in the fitted cycles, (n,)."""
-    assert measurement.stress is not None
     growth = np.ones(measurement.stress.size)
     last = source.last_cycle or math.inf
     for number, part in cycles_of(measurement).items():

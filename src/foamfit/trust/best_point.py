@@ -291,7 +291,6 @@ class BestPoint:
         curve = next((name for name in objective.counted if name.startswith("stress")), None)
         if not objective.driven or test.displacement is None or curve is None or not self.misfits:
             return None
-        assert test.stress is not None
         least = LOADED * float(test.stress.max())
         speed = gaussian_filter1d(test.displacement, max(test.stress.size / 200, 1.0), order=1)
         rubs = np.sign(speed) * (test.stress > least)

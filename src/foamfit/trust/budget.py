@@ -295,7 +295,6 @@ def judged(
     impact, test = best.problem.objective.drive == "impact", best.problem.measurement
     if best.problem.kept if impact else settled and best.misfits:
         clipped, zero = is_clipped(test), test.zeros.get("stress", 0.0)
-        peak = 0.0 if test.stress is None else float(test.stress.max())
-        if settled or clipped or zero > DOUBTFUL * peak:
+        if settled or clipped or zero > DOUBTFUL * float(test.stress.max()):
             return "weak", say("why", "contested_held", settled=settled, clipped=clipped)
     return state

@@ -334,7 +334,6 @@ def lost_height(best: BestPoint) -> float:
         return 0.0
     if not (best.names and best.misfits):
         return 0.0
-    assert test.stress is not None
     assert test.displacement is not None
     level, peak = test.noise.of("stress"), float(test.stress.max())
     loaded = test.stress > max(GONE * peak, 4.0 * (level.sigma if level else 0.0))

@@ -199,7 +199,6 @@ def _inner_loops(best: BestPoint) -> dict[str, Any] | None:
     if not hysteretic or curve is None or any(law.remembers for law in hysteretic):
         return None
     assert test.displacement is not None
-    assert test.stress is not None
     squares, inside, spans = (curve - test.stress) ** 2, np.zeros(curve.size, dtype=bool), []
     for first, stop in inner_loops(test.displacement):
         inside[first:stop] = True
@@ -222,7 +221,6 @@ def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict
     test, model = best.problem.measurement, best.problem.model
     objective, errs = best.problem.objective, bool(best.names) and best.misfits
     several = [name for name in best.names if len(model.kinds) > 1 and name not in NUISANCE]
-    assert test.stress is not None
     ended = float(test.stress[-3:].mean() / test.stress.max())
     misfit, curve = max((objective.off(best.simulated, n) or 0.0, n) for n in objective.counted)
     return {
@@ -265,7 +263,7 @@ def _is_led(test: Measurement) -> bool:
 
     Such a stress bends where the springs switch, and smoothing rounds its bends.
     """
-    if test.displacement is None or test.stress is None:
+    if test.displacement is None:
         return False
     n = int(np.argmax(test.displacement)) + 1
     curves = np.column_stack((test.displacement[:n], test.stress[:n]))

@@ -216,7 +216,7 @@ def _panels(found: Prediction) -> list[Panel]:
     m, told = found.measurement, {c.channel: c for c in found.curves.values()}
     stress, moved = told.get("stress"), told.get("displacement")
     motion, panels = m.displacement if moved is None else moved.predicted, list[Panel]()
-    if m.displacement is not None and motion is not None and m.stress is not None:
+    if m.displacement is not None and motion is not None:
         strain, height = motion / m.specimen.height, m.specimen.height
         loop = measured(m.displacement / height, m.stress)
         loop += [Line(strain, m.stress if stress is None else stress.predicted, *PREDICTED)]
