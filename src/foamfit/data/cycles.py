@@ -95,14 +95,10 @@ def choose_cycles(cycles: list[Cycle], number: int | None, last: int | None) -> 
     first = _choose(cycles, number)
     if last is None or last == number:
         return first
-    wrong = f"cycles {number} to {last} cannot be taken"
-    if first is None or len(cycles) == 1:
-        raise InputError(f"{wrong}: the record has no cycles to choose from; leave them out.")
-    end = _choose(cycles, last)
-    assert end is not None  # there are cycles
-    if end.place <= first.place:
-        wrong += f": cycle {last} comes before cycle {number} in the file"
-        raise InputError(f"{wrong}; give them in order, like {last}-{number}.")
+    end = _choose(cycles, last) if len(cycles) > 1 else None
+    if first is None or end is None or end.place <= first.place:
+        wrong = f"cycles {number} to {last} cannot be taken"
+        raise InputError(f"{wrong}: the record has no such cycles in this order; name others.")
     return replace(first, end=end.end, last=end.number, turn=end.top)
 
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from foamfit.data import units
 from foamfit.data.measurement import GRAVITY, Entry, Noise, Specimen, Striker, Window, interior_node
 from foamfit.errors import InputError, naming
-from foamfit.files import read_whole
+from foamfit.files import read_whole, reason
 from foamfit.terminal import printable
 
 _LARGEST = 1_000_000  # characters of a TOML
@@ -144,8 +144,7 @@ def read_bytes(path: Path, otherwise: str) -> bytes:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {otherwise}.") from None
     except (OSError, ValueError) as error:  # ValueError: a name with a null character
-        why = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot be read ({why}); {otherwise}.") from None
+        raise InputError(f"{path}: cannot be read ({reason(error)}); {otherwise}.") from None
 
 
 def load_toml(path: Path, otherwise: str) -> dict[str, Any]:

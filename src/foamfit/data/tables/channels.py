@@ -228,11 +228,7 @@ def negative_channels(channels: Mapping[str, Array], time: Array | None) -> tupl
             opposite = np.dot(values - values.mean(), upright[other] - upright[other].mean()) < 0.0
             wrong += [channel] * bool(opposite)
     if time is not None and (velocity := upright.get("velocity")) is not None:
-        if motion:  # whose derivative it is
-            against = np.dot(np.gradient(upright[motion], time[kept]), velocity) < 0.0
-        else:  # its integral rises first
-            against = _falls(integrated_twice(time[kept], velocity)[0])
-        wrong += ["velocity"] * bool(against)
+        wrong += ["velocity"] * _falls(integrated_twice(time[kept], velocity)[0])
     return wrong, True
 
 

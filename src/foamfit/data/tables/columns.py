@@ -181,20 +181,17 @@ def _assigned(
     found: dict[str, int] = {}
     strained = "strain" in given or any(h.rank("strain") is not None for h in table.headers)
     for channel in _channels(table, given):
+        if channel not in given and TWINS.get(channel) in given:
+            continue  # its twin in the TOML takes precedence
         if channel in given:
             found[channel] = _place(table, channel, given[channel].column)
             continue
         ranks = {k: r for k, h in enumerate(table.headers) if (r := h.rank(channel)) is not None}
-        if interior_node(channel):  # the TOML may assign this column to the top
-            taken = {found[c] for c in given if c in found}
-            ranks = {k: r for k, r in ranks.items() if k not in taken}
         best = _best(table, channel, ranks)
         if not best or (ranks[best[0]] == WEAK and strained):
             continue
         if len(best) == 1:
             found[channel] = best[0]
-            continue
-        if TWINS.get(channel) in given:
             continue
         if unclear is None:
             both = " and ".join(map(table.name, best))
@@ -202,10 +199,6 @@ def _assigned(
             remedy = f"keep one, or write {entry} in [columns]"
             raise InputError(f"columns {both} could both be the {channel}; {remedy}.")
         unclear[channel] = best
-    # A channel given in the TOML takes precedence over a twin found by its header.
-    for named, twin in TWINS.items():
-        if named in given and twin not in given:
-            found.pop(twin, None)
     # A true stress cannot be converted: the current cross-section is unknown.
     true = "stress" in found and table.headers[found["stress"]].measure("stress")
     if true and "stress" not in given and "force" in found:
@@ -270,9 +263,6 @@ def si_factor(table: Table, channel: str, k: int, given: Entry | None) -> float:
             "instant; give the force or the nominal (engineering) stress."
         )
     unit = given.unit if given.unit is not None else header.unit
-    over = header.text.partition("/")[2].strip()  # Weg/mm, if assigned in the TOML only
-    if unit is None and over and in_si(channel, over, given.scale_unit) is not None:
-        unit = over
     if unit is None and in_si(channel, "", given.scale_unit) is None:
         usual = channel_of(channel).unit
         if given.scale_unit:

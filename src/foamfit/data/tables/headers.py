@@ -14,16 +14,11 @@ WEAK = 3  # rank of a header that only suggests a displacement
 
 
 class Channel(NamedTuple):
-    """SI unit of a channel, a unit for examples, and its names in headers."""
+    """SI unit of a channel, a unit for examples, and its names in headers, the best one first."""
 
     si: str
     unit: str
-    named: str
-
-    @property
-    def words(self) -> list[str]:
-        """Names of the channel in headers, the best one first."""
-        return self.named.split()
+    words: str
 
 
 _MOVED = "displacement disp weg standardweg verschiebung stauchung compression"
@@ -37,7 +32,7 @@ CHANNELS = {
     "velocity": Channel("m/s", "m/s", "velocity speed geschwindigkeit"),
     "cycle": Channel("", "", ""),  # assigned in [columns] only
 }
-_WORDS = {word for channel in CHANNELS.values() for word in channel.words}
+_WORDS = {word for channel in CHANNELS.values() for word in channel.words.split()}
 # Ambiguous words: the unit decides which quantity is meant.
 _BY_UNIT = {"spannung", "stauchung", "compression"}
 # Words for a displacement if no better name is present: travel of a machine, or a gap.
@@ -89,7 +84,7 @@ class Header:
 
     def rank(self, channel: str) -> int | None:
         """Return how well the header names a channel: 0 is best, None not at all."""
-        words, node = channel_of(channel).words, interior_node(channel)
+        words, node = channel_of(channel).words.split(), interior_node(channel)
         poor = 4 if self.measure(channel) else 0
         numbers = [word for word in self.words if word.isdecimal()]
         if [int(number) for number in numbers] != ([] if node is None else [node]):
