@@ -145,8 +145,7 @@ class Candidate:
         striker = None
         if self.drive == "impact":
             time = np.linspace(0.0, lasts, IMPACT_SAMPLES)
-            alone = test.displacement is None and test.striker is not None and not with_motion
-            moved = None if alone else np.linspace(0.0, 0.5 * height, time.size)
+            moved = np.linspace(0.0, 0.5 * height, time.size)
             striker = replace(test.striker or Striker(), mass=self.mass, velocity=self.velocity)
             was = test.striker and test.striker.velocity
             if was and self.velocity and "velocity" in spreads:
@@ -173,8 +172,7 @@ class Candidate:
         """Return the number of samples of the rig per simulated sample."""
         if rig.sampling is not None and self.mass is not None:  # the rate of impacts
             return rig.sampling * float(time[-1] - time[0]) / time.size
-        rows = test.rows.used if test.displacement is None else test.displacement.size
-        return rows / max(len(test.cycles), 1) * self.cycles / time.size
+        return test.instants.size / max(len(test.cycles), 1) * self.cycles / time.size
 
     def toml(self, test: Measurement) -> str:
         """Return the TOML of the test, for its record."""
