@@ -293,7 +293,7 @@ def _assess(
             made = Intervals(better=better)
             if better is None or restarts == IMPROVEMENTS:
                 minima = [*tracker.ends, *left.minima]
-                made = assess(best, choice, tracker, minima, budget, announce, left.ranges)
+                made = assess(best, choice, tracker, minima, budget, announce)
             if made.better is None or restarts == IMPROVEMENTS:
                 break
             tracker.consider(made.better)

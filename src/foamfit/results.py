@@ -105,8 +105,6 @@ class Intervals:
     ends: dict[str, tuple[float, float]] = field(default_factory=dict)
     methods: dict[str, str] = field(default_factory=dict)
     profiles: tuple[Profile, ...] = ()  # including incomplete ones
-    # Parameters with a local interval although the cost along them is not a parabola
-    doubtful: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()  # why the intervals differ from those requested
     better: Array | None = None  # a point of lower cost from which the fit should continue

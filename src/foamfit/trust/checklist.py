@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from itertools import chain, groupby
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -41,7 +40,6 @@ BOUGHT = 0.02
 # The curves contradict a prior if they differ by more than this many standard deviations of both.
 AGAINST = 3.0
 ALONE = 60  # iterations of a descent without a prior
-ASIDE = 0.0, -0.2, 0.2  # relative changes of the parameter at its starts, to find other minima
 # The stress is gone below this share of its peak, and a specimen has recovered below this share of
 # the largest strain.
 GONE, RECOVERED = 0.02, 0.5
@@ -258,11 +256,7 @@ def _of_priors(best: BestPoint, estimates: Estimates, with_error: Sequence[str])
     for prior in given:
         others = np.arange(best.residual.size) != objective.n_data + objective.priors.index(prior)
         functions = squares(Tracker(objective), space, others)
-        aside = np.zeros(best.values.size)
-        aside[best.index[prior.name]] = best.size(prior.name)
-        points = [space.encode(best.values + change * aside) for change in ASIDE]
-        ends = [descend(*functions, one, space.box, ALONE, enough=1e-6) for one in points]
-        end = min(ends, key=attrgetter("cost"))
+        end = descend(*functions, space.encode(best.values), space.box, ALONE, enough=1e-6)
         values = space.decode(end.point)
         slopes = problem.slopes(values, names)[others]
         found = covariance(slopes, end.residual, objective.sizes, sizes, objective.unit**2)
@@ -357,18 +351,14 @@ def _time_shift(best: BestPoint, estimates: Estimates) -> Check:
     """Check what the equation of motion of the striker says of the clocks (`data.calibration`)."""
     test, drive, found = best.problem.measurement, best.problem.objective.drive, best.contradictions
     fitted, striker = best.problem.objective.time_shift, test.striker
-    shift = estimates.get("time_shift") if fitted else None
-    held = fitted and not (shift and shift.vary)
-    clocks = [one for one in found if one.quantity == "time_shift"]
-    contradicted = len(found) > len(clocks) and drive == "impact"
-    clipped, moving = is_clipped(test), bool(striker and striker.mass and striker.velocity)
-    facts: dict[str, Any] = {"held": held, "clipped": clipped, "contradicted": contradicted}
-    facts |= {"shift": shift and shift.value, "moving": moving}
-    if clocks:
+    one = estimates.get("time_shift") if fitted else None
+    facts: dict[str, Any] = {"shift": one and one.value, "held": fitted and not (one and one.vary)}
+    if clocks := [one for one in found if one.quantity == "time_shift"]:
         warning = say("contradiction", "said", one=clocks[0], drive=drive, stated=fitted)
         return _check("time_shift", False, warnings=[warning], late=clocks[0].ratio, **facts)
-    fine = fitted and not held
-    if moving and not (fitted or clipped or contradicted):
+    fine = fitted and not facts["held"]
+    shown = striker is not None and striker.mass and striker.velocity and not is_clipped(test)
+    if shown and not fitted and not (found and drive == "impact"):
         with suppress(InputError):
             check_time_shift(test, drive)
             fine = True

@@ -24,9 +24,8 @@ from foamfit.fitting.search import SearchRecord
 from foamfit.parts import ParameterEstimate
 from foamfit.results import Correlation, Curves, Fit, Intervals, Switch
 from foamfit.solve.cache import SPENT
-from foamfit.springs import laws
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
-from foamfit.text import engineering, listed
+from foamfit.text import engineering
 from foamfit.trust import covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth
 from foamfit.trust.budget import Settled, changed, judged, make_budget, of_flight, settle
@@ -45,7 +44,6 @@ from foamfit.trust.residuals.law_error import CurveError
 # A profile narrower than the local interval by more than this factor has stalled.
 STALLED = 2.0
 SHORT = 0.8  # share of the change by friction that a linear step finds, in synthetic records
-CLOSE = 0.9  # smallest correlation that is named
 UNDER = 0.05  # share of the peak stress, above which a record ends under load
 CLOSED = 0.005  # area of a loop over peak stress times largest strain, below which it is closed
 
@@ -202,18 +200,14 @@ def _inner_loops(best: BestPoint) -> dict[str, Any] | None:
     squares, inside, spans = (curve - test.stress) ** 2, np.zeros(curve.size, dtype=bool), []
     for first, stop in inner_loops(test.displacement):
         inside[first:stop] = True
-        ends = first, min(stop, curve.size - 1)
-        start, end = f"sample {ends[0]}", f"{ends[1]}"
-        if test.time is not None:
-            start, end = (engineering(test.time[at], "s") for at in ends)
-        spans.append(f"from {start} to {end}")
+        ends = [first, min(stop, curve.size - 1)]
+        clock = ends if test.time is None else test.time[ends].tolist()
+        unit = "" if test.time is None else "s"
+        spans.append("from {} to {}".format(*(engineering(at, unit) for at in clock)))
     if not spans or not (total := float(squares.sum())) > 0.0:
         return None
-    with_loops = [law for law in map(laws.law, laws.kinds()) if law.remembers]
-    groups = (hysteretic, with_loops)
-    without, others = (listed(dict.fromkeys(f"{law.title}s" for law in group)) for group in groups)
     shares = {"samples": float(inside.mean()), "squares": float(squares[inside].sum()) / total}
-    return {"spans": spans, "without": without, "others": others, **shares}
+    return shares | {"spans": spans, "laws": [f"{law.title}s" for law in hysteretic]}
 
 
 def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict[str, Any]:
@@ -379,8 +373,7 @@ def _varied(
     if not 0.5 * (ends[1] - ends[0]) <= covariance.NOTHING * best.sizes[column]:
         return ParameterEstimate(value, None, None, unit, True, state, why, range=span)
     method = "local covariance" if stalled else method
-    doubtful = name in intervals.doubtful and method == "local covariance"
-    why = say("why", "interval", why=why, doubtful=doubtful, stalled=stalled)
+    why = say("why", "interval", why=why, stalled=stalled)
     ci95, stderr = (max(ends[0], low), min(ends[1], high)), float(best.spread.stderr[column])
     return ParameterEstimate(value, stderr, ci95, unit, True, state, why, method, span)
 
@@ -419,17 +412,8 @@ def _state_of(
     past = ends[0] <= limits[0], ends[1] >= limits[1]
     if any(past) and "open" not in why:
         why = say("why", "open", why=why, limit=limits[past.index(True)], unit=unit)
-    together = insight.combination(name, covariance.WEAK / 1.96) or _companion(best, name)
+    together = insight.combination(name, covariance.WEAK / 1.96)
     return state, f"{why}; {together}" if together else why
-
-
-def _companion(best: BestPoint, name: str) -> str:
-    """Name the most correlated parameter; "" if no correlation reaches `CLOSE`."""
-    me = best.names.index(name)
-    row = np.nan_to_num(best.spread.correlation[me])
-    row[me] = 0.0
-    at = int(np.argmax(np.abs(row)))
-    return say("why", "correlated", name=best.names[at], r=row[at]) if abs(row[at]) >= CLOSE else ""
 
 
 def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int | None]:

@@ -10,9 +10,9 @@ from __future__ import annotations
 import importlib.util
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -23,8 +23,8 @@ from foamfit.results import Intervals, Profile
 from foamfit.springs.parameters import NUISANCE
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import NOTHING, WEAK, Uncertainty
-from foamfit.trust.profile import BETTER, PLACED, SIDES, Refit, departures, trace
+from foamfit.trust.covariance import WEAK, Uncertainty
+from foamfit.trust.profile import BETTER, PLACED, Refit, departures, trace
 
 # "auto" profiles a parameter if the root of the cost departs from a straight line by this share at
 # an end of its local interval.
@@ -72,14 +72,13 @@ def assess(
     minima: Sequence[Array] = (),
     budget: float = math.inf,
     announce: Announce = lambda _: None,
-    ranges: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> Intervals:
     """Compute the requested intervals.
 
     `minima` are the points at which the descents of the search ended. At the deadline of the
     tracker `searched` the computation stops with partial results. "auto" begins no new profile
-    after `budget` evaluations, and none for a parameter whose range (`ranges`) is wider than its
-    local interval. `announce` is called with the expected run time beforehand.
+    after `budget` evaluations, and none if there is model error. `announce` is called with the
+    expected run time beforehand.
     """
     method, known = choice.method, best.known
     if method == "local":
@@ -90,32 +89,27 @@ def assess(
     if not known:
         return Intervals(warnings=() if method == "auto" else (say("interval", "nothing"),))
     if method != "auto":
-        count = evaluations_of(best, choice)
-        announce(say("interval", "cost", by=method, count=count, seconds=_seconds(best, count)))
+        count, began = evaluations_of(best, choice), time.perf_counter()
+        tracker.consider(best.values)
+        seconds = count * (time.perf_counter() - began)
+        announce(say("interval", "cost", by=method, count=count, seconds=seconds))
     if method == "mcmc":
         return _by_mcmc(best, choice, tracker)
     others = [(x, residual := tracker.consider(x), _halves(best, x, residual)) for x in minima]
-    if method == "profile":
-        return _with_minima(best, _by_profiles(best, dict.fromkeys(known, SIDES), tracker), others)
-    far = departures(best)
-    for point, residual, _ in others:  # a minimum within the cut but outside the local interval
-        apart = np.abs(point - best.values)[best.places] / best.spread.stderr
-        near = (best.rises(residual) < best.quantiles**2) & (apart > best.quantiles)
-        far |= {name: math.inf for name, found in zip(best.names, near, strict=True) if found}
-    bent = sorted((name for name in known if far[name] > BENT), key=lambda name: -far[name])
-    # Where the range is wider, model error outweighs noise, and a local interval is enough.
-    local = [n for n in bent if n in ranges and np.ptp(ranges[n]) > np.ptp(best.local(n))]
-    wide, sides = _with_minima(best, Intervals(), others).ends, dict[str, list[float]]()
-    for name in (name for name in bent if name not in local):
-        own, ends = best.local(name), wide.get(name, best.local(name))
-        # Where other minima leave the parameter undetermined, a profile would not change that; on a
-        # side where one extends the interval, it would hardly do so.
-        open_to = [sign for sign, a, b in zip(SIDES, own, ends, strict=True) if a == b]
-        if open_to and np.ptp(ends) <= 2.0 * NOTHING * best.size(name):
-            sides[name] = open_to
-    made = _by_profiles(best, sides, tracker, budget)
-    made = _with_minima(best, replace(made, doubtful=(*made.doubtful, *local)), others)
-    return made if best.misfits or made.better is not None else _with_far(best, made, tracker)
+    bent, far = known, dict[str, float]()
+    if method == "auto" and best.misfits:  # the range, which includes model error, decides
+        bent = []
+    elif method == "auto":
+        far = departures(best)
+        for point, residual, _ in others:  # a minimum within the cut but outside the local interval
+            apart = np.abs(point - best.values)[best.places] / best.spread.stderr
+            near = (best.rises(residual) < best.quantiles**2) & (apart > best.quantiles)
+            far |= {name: math.inf for name, found in zip(best.names, near, strict=True) if found}
+        bent = sorted((name for name in known if far[name] > BENT), key=lambda name: -far[name])
+    made = _by_profiles(best, bent, tracker, budget if method == "auto" else math.inf)
+    made = _with_minima(best, made, others)
+    done = method == "profile" or best.misfits or made.better is not None
+    return made if done else _with_far(best, made, tracker)
 
 
 def evaluations_of(best: BestPoint, choice: Choice) -> float:
@@ -214,38 +208,33 @@ def _halves(best: BestPoint, point: Array, residual: Array) -> Array:
 
 
 def _by_profiles(
-    best: BestPoint,
-    sides: Mapping[str, Sequence[float]],
-    tracker: Tracker,
-    budget: float = math.inf,
+    best: BestPoint, names: Sequence[str], tracker: Tracker, budget: float
 ) -> Intervals:
-    """Profile the `sides` of some parameters, until a better point is found or time is up."""
+    """Profile some parameters, until a better point is found or time is up."""
     allowed = tracker.objective.evaluations + budget
     profiles, better = list[Profile](), None
-    for name, signs in sides.items():
+    for name in names:
         if tracker.objective.evaluations >= allowed:
             break
-        profile, better = trace(best, name, tracker, signs)
+        profile, better = trace(best, name, tracker)
         profiles.append(profile)
         if better is not None or profile.stopped:
             break
     ends = {one.name: one.ci95 for one in profiles if one.complete}
-    left = tuple(name for name in sides if name not in ends)
-    facts = {"done": len(ends), "count": len(sides), "names": ", ".join(left)}
+    left = ", ".join(name for name in names if name not in ends)
+    facts = {"done": len(ends), "count": len(names), "names": left}
     stopped = (one.stopped for one in profiles if one.stopped)
     warnings = tuple(say("interval", "profiles", by=by, **facts) for by in stopped)
     methods = dict.fromkeys(ends, "profile likelihood")
-    return Intervals(ends, methods, tuple(profiles), left, warnings=warnings, better=better)
+    return Intervals(ends, methods, tuple(profiles), warnings=warnings, better=better)
 
 
 def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
     """Return the 2.5th and 97.5th percentiles of a Markov chain, or a warning if it is short."""
     chain = mcmc(best, choice.draws, choice.seed, tracker)
-    few = len(chain.samples) < ENOUGH_DRAWS
-    note = chain.sentence([name for name in best.names if name not in best.known], few)
-    if few:
+    note = chain.sentence([name for name in best.names if name not in best.known])
+    if len(drawn := chain.samples) < ENOUGH_DRAWS:
         return Intervals(warnings=(note,))
-    drawn = chain.samples
     # To first order: contact and zeros that are held are off by their errors, so is the motion.
     off_by = [best.shifts] if best.problem.kept else []
     off_by += [best.modes] if best.misfits else []
@@ -258,22 +247,9 @@ def _by_mcmc(best: BestPoint, choice: Choice, tracker: Tracker) -> Intervals:
     ends = {name: (a, b) for name, a, b in pairs if name in best.known}
     fine = chain.converged and chain.stopped is None
     samples = drawn.reshape(-1, chain.walkers, len(best.names)).T  # (k, walkers, steps)
-    return Intervals(
-        ends,
-        dict.fromkeys(ends, "MCMC"),
-        notes=(note,) if fine else (),
-        warnings=() if fine else (note,),
-        draws=dict(zip(best.names, samples, strict=True)),
-    )
-
-
-def _seconds(best: BestPoint, evaluations: float) -> float:
-    """Return the expected run time (s), from ten evaluations and one set of slopes."""
-    began = time.perf_counter()
-    for _ in range(10):
-        best.problem.objective.residual(best.values)
-    best.problem.slopes(best.values, best.names)
-    return evaluations * (time.perf_counter() - began) / 10.0
+    draws, told = dict(zip(best.names, samples, strict=True)), "notes" if fine else "warnings"
+    said: dict[str, Any] = {told: (note,)}
+    return Intervals(ends, dict.fromkeys(ends, "MCMC"), draws=draws, **said)
 
 
 # ---------------------------------------------------------------- Markov chains
@@ -287,7 +263,7 @@ class MarkovChain:
     steps: int  # of each walker
     burn_in: int  # number of first steps discarded
     walkers: int
-    autocorrelation: float  # integrated autocorrelation time of the slowest parameter, steps
+    times: float  # length in integrated autocorrelation times of the slowest parameter
     stopped: str | None = None  # what ended it early
 
     @property
@@ -295,13 +271,9 @@ class MarkovChain:
         """Whether the chain has at least fifty autocorrelation times, as emcee recommends."""
         return self.times >= 50.0
 
-    @property
-    def times(self) -> float:
-        """Length of the chain in autocorrelation times."""
-        return (self.steps - self.burn_in) / self.autocorrelation
-
-    def sentence(self, lost: Sequence[str] = (), few: bool = False) -> str:
+    def sentence(self, lost: Sequence[str] = ()) -> str:
         """Describe length and convergence; `lost` parameters have no intervals."""
+        few = len(self.samples) < ENOUGH_DRAWS
         return say("interval", "chain", chain=self, lost=lost, few=few)
 
 
@@ -365,5 +337,5 @@ def mcmc(best: BestPoint, steps: int, seed: int, tracker: Tracker | None = None)
     chain = np.array(steps_done[done // 5 :]).reshape(-1, count, k)
     with np.errstate(invalid="ignore", divide="ignore"):  # a walker that never moved
         times = emcee.autocorr.integrated_time(chain, tol=0, quiet=True) if done > 10 else [np.inf]
-    slowest = float(np.max(np.nan_to_num(times, nan=np.inf)))
-    return MarkovChain(chain.reshape(-1, k) * best.sizes, done, done // 5, count, slowest, stopped)
+    length = len(chain) / float(np.max(np.nan_to_num(times, nan=np.inf)))
+    return MarkovChain(chain.reshape(-1, k) * best.sizes, done, done // 5, count, length, stopped)

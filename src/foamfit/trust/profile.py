@@ -7,7 +7,6 @@ cost is a parabola, profile and local interval are therefore the same.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +33,6 @@ OUTWARD, INWARD = 14, 3
 PLACED = 0.03
 # A profile that falls below the best point by this share of the cut has found a better minimum.
 BETTER = 0.01
-SIDES = (-1.0, 1.0)
 
 
 @dataclass(eq=False)
@@ -155,16 +153,9 @@ class _Side:
 
     @property
     def bound(self) -> float:
-        """Value at which the root of the rise crosses that of the cut, or else the limit.
-
-        The local end if there is no refit.
-        """
-        if len(self.refits) == 1:
-            return self._within(self.value(self.refits[0]) + self.sign * self.half)
-        if self.parabola:
-            return self._within(self.crossing(*self.refits))
-        inner, outer = self.bracket
-        return self.limit if outer is None else self.crossing(inner, outer)
+        """Value at which the root of the rise crosses that of the cut, or else the limit."""
+        inner, outer = self.refits if self.parabola else self.bracket
+        return self.limit if outer is None else self._within(self.crossing(inner, outer))
 
     def follow(self) -> None:
         """Go outward until well beyond the cut, and place the crossing."""
@@ -200,22 +191,19 @@ class _Side:
         return self.limit if self.sign * (value - self.limit) > 0.0 else value
 
 
-def trace(
-    best: BestPoint, name: str, tracker: Tracker, sides: Sequence[float] = SIDES
-) -> tuple[Profile, Array | None]:
-    """Follow the least cost along a parameter past the 95 % cut, by default to both `sides`.
+def trace(best: BestPoint, name: str, tracker: Tracker) -> tuple[Profile, Array | None]:
+    """Follow the least cost along a parameter past the 95 % cut to both sides.
 
     It uses the adjusted likelihood ratio: the rise of the cost over `Covariance.inflation` is a χ²
     of one degree of freedom even if noise is correlated (Chandler & Bate 2007, Biometrika 94, 167).
-    `ci95` has the local end on a side that is not followed. If the deadline or Ctrl-C ends it
-    early, it is incomplete. A point of clearly lower cost than the best one, if there is one, is
-    returned too.
+    If the deadline or Ctrl-C ends it early, it is incomplete. A point of clearly lower cost than
+    the best one, if there is one, is returned too.
     """
     refit, stopped = Refit(best, tracker, name), None
     low, high = _Side(refit, -1.0), _Side(refit, 1.0)
     try:
-        for side in (one for one in (low, high) if one.sign in sides):
-            side.follow()
+        low.follow()
+        high.follow()
     except STOPPING as error:
         stopped = what_stopped(error)
     refits = low.refits[::-1] + high.refits[1:]

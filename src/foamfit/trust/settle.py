@@ -147,8 +147,6 @@ def free_zero(problem: Problem, tracker: Tracker, given: Collection[str]) -> Pro
     freed = replace(problem, params=problem.params.copy())
     freed.params[name].vary = True
     held = BestPoint(freed, values)
-    if abs(_zero_by_errors(held, name, step=True)) < SHOWN / 2.0:
-        return problem
     other = _afresh(tracker, [*tracker.ends, values])
     descend_again(freed, other)
     assert other.best_values is not None  # the start can be simulated
@@ -158,23 +156,14 @@ def free_zero(problem: Problem, tracker: Tracker, given: Collection[str]) -> Pro
     follows = all(
         new.law <= min(0.5 * old.law, 0.25 * math.sqrt(new.noise.variance)) for old, new in pairs
     )
-    if not follows or abs(_zero_by_errors(best, name)) < SHOWN:
+    error = best.spread.stderr[best.names.index(name)] if name in best.names else math.inf
+    if not follows or abs(best.value(name)) < SHOWN * error:
         return problem
     tracker.best_values, tracker.best_cost = other.best_values, other.best_cost
     tracker.ends += other.ends
     note = "The record begins in contact; the law follows it only with another zero of the force "
     note += "than that of the file, so stress_zero is fitted."
     return replace(freed, notes=(*problem.notes, note))
-
-
-def _zero_by_errors(best: BestPoint, name: str, *, step: bool = False) -> float:
-    """Return a parameter over its standard error, or a Gauss-Newton step of it over that error."""
-    if name not in best.names:
-        return 0.0
-    column, value = best.names.index(name), best.value(name)
-    if step:
-        value = float(best.answer(best.residual[:, None])[column, 0])
-    return value / float(best.spread.stderr[column])
 
 
 def weigh_priors(problem: Problem, tracker: Tracker) -> Problem:

@@ -44,16 +44,12 @@ class NoiseProcess:
         return np.asarray(np.fft.irfft(transfer))
 
     @cached_property
-    def white(self) -> float:
-        """Variance of the driving white noise over that of the process."""
-        return float(1.0 / self._response(1 << 14)[0])
-
-    @cached_property
     def tau(self) -> float:
         """Autocorrelation time 1 + 2 Σ ρ_k, at least one, in samples."""
         if not self.coefficients.size:
             return 1.0
-        return max(self.white / (1.0 - float(self.coefficients.sum())) ** 2, 1.0)
+        white = 1.0 / float(self._response(1 << 14)[0])  # variance of what drives it, over its own
+        return max(white / (1.0 - float(self.coefficients.sum())) ** 2, 1.0)
 
     def scatter(self, kept: Array) -> float:
         """Return the standard deviation behind a filter, whose autocorrelation is `kept`."""
