@@ -138,7 +138,7 @@ class Given:
     )
     intervals: str = option(
         "Method of the 95 % intervals: auto is the local covariance, and profiles of the "
-        "parameters along which the cost is not parabolic and whose range is not wider.",
+        "parameters along which the cost is not parabolic, unless the law errs.",
         "auto",
         choices=METHODS,
         python_only=True,

@@ -2,8 +2,8 @@
 
 The best values of a scattering parameter in the tests, its common value and its spread depend on
 each other. For a given spread, a fit pulls the values towards the common value. The values without
-this pull follow from the curvature of the cost, and REML estimates common value and spread from
-them (`trust.scatter`). This is repeated until the spread no longer changes (Laplace's method).
+this pull follow from the curvature of the cost, and give common value and spread
+(`trust.scatter`). This is repeated until the spread no longer changes (Laplace's method).
 """
 
 from __future__ import annotations

@@ -6,7 +6,6 @@ with sensitivities.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -100,6 +99,11 @@ class BestPoint:
         """Limits of a parameter, SI."""
         parameter = self.problem.params[name]
         return float(parameter.min), float(parameter.max)
+
+    def at_limits(self, name: str) -> list[float]:
+        """Return the limits at which a parameter lies, SI."""
+        near = covariance.AT_LIMIT * self.size(name)
+        return [x for x in self.limits(name) if abs(self.value(name) - x) <= near]
 
     def local(self, name: str) -> Ends:
         """Ends of the local 95 % interval of one of the k parameters, not cut at its limits."""
@@ -202,18 +206,12 @@ class BestPoint:
 
     @cached_property
     def modes(self) -> Array:
-        """Change of the residual by one standard deviation of each mode of what drives, (n, q).
-
-        They leave no larger residual than there is.
-        """
+        """Change of the residual by one standard deviation of each mode of what drives, (n, q)."""
         objective = self.problem.objective
         if (modes := objective.by_motion(self.values)) is None:
             return np.empty((self.residual.size, 0))
         modes = modes if objective.weighing is None else objective.weighing(modes)
-        modes = np.pad(modes, ((0, len(objective.priors)), (0, 0)))
-        basis = basis_of(self.jacobian)
-        left = float(np.linalg.norm(modes - basis @ (basis.T @ modes)))
-        return modes * min(1.0, math.sqrt(self.cost) / max(left, 1e-300))
+        return np.pad(modes, ((0, len(objective.priors)), (0, 0)))
 
     def gradient(self, step: Array) -> Array:
         """Return half the gradient of the cost after a step of the k parameters.

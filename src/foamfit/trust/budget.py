@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -212,15 +212,14 @@ def _of_covariance(best: BestPoint) -> Iterator[tuple[str, dict[str, float]]]:
 Way = Mapping[str, float]  # factor of each quantity that is changed, and the time shift, s
 
 
-@dataclass(frozen=True, eq=False)
-class Settled:
-    """Values of all parameters (n,), SI, after a way to settle a contradiction; None if it fails.
+class Settled(NamedTuple):
+    """Values of all parameters (n,), SI, after a way to settle a contradiction; NaN if it fails.
 
     `words` is the way, like "velocity × 0.88 and force × 1.30".
     """
 
     words: str
-    values: Array | None
+    values: Array
 
 
 def of_flight(best: BestPoint) -> tuple[Contradiction, ...]:
@@ -261,8 +260,7 @@ def settle(best: BestPoint, found: Sequence[Contradiction]) -> tuple[Settled, ..
         moved = best.values.copy()
         for name, by in way.items():
             moved += response(best, name, by - (name != nuisance.TIME_SHIFT))
-        fails = not np.all(np.isfinite(moved))
-        out.append(Settled(listed(words) if words else "", None if fails else moved))
+        out.append(Settled(listed(words) if words else "", moved))
     return tuple(out)
 
 
@@ -278,8 +276,8 @@ def judged(
         return state
     at, zero = best.index[name], best.problem.measurement.origins.get(name, 0.0)
     for one in settled:
-        there = None if one.values is None else float(one.values[at]) + zero
-        if there is None or not ends[0] <= there <= ends[1]:
+        there = float(one.values[at]) + zero
+        if not ends[0] <= there <= ends[1]:
             return "weak", say("why", "contested", settled=one, there=there, unit=unit_of(name))
     # The law errs, and the contradiction, or a doubtful force in an impact, may be the reason.
     impact, test = best.problem.objective.drive == "impact", best.problem.measurement

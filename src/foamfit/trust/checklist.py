@@ -26,7 +26,7 @@ from foamfit.results import Check, Intervals
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 from foamfit.trust import SENTENCES, say
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import AT_LIMIT, WEAK, covariance
+from foamfit.trust.covariance import WEAK, covariance
 
 # A fit is unacceptable if the misfit of a curve exceeds this multiple of its standard deviation.
 UNACCEPTABLE = 0.5
@@ -233,8 +233,7 @@ def _of_intervals(
     yield _check("intervals", answer, warnings=intervals.warnings, made=methods)
     stuck, natural = [], []
     for name in (name for name in with_error if estimates[name].vary):
-        near = AT_LIMIT * best.size(name)
-        for bound in (b for b in best.limits(name) if abs(best.value(name) - b) <= near):
+        for bound in best.at_limits(name):
             if bound == 0.0 and may_vanish(name):
                 natural.append(name)
             else:

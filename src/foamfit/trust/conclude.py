@@ -227,16 +227,10 @@ def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict
         "lost": lost_height(best),
         "stayed": test.last_cycle is None and test.start_strain != 0.0 and _is_closed(best),
         "alone": errs and not (record.stopped or record.led) and 0 < record.agreeing < 2,
-        "cornered": next((name for name in several if errs and _is_at_limit(best, name)), ""),
+        "cornered": next((name for name in several if errs and any(best.at_limits(name))), ""),
         "off": misfit if misfit > POOR else 0.0,
         "curve": curve,
     }
-
-
-def _is_at_limit(best: BestPoint, name: str) -> bool:
-    """Return whether a parameter lies at a limit other than zero."""
-    near = covariance.AT_LIMIT * best.size(name)
-    return any(limit and abs(best.value(name) - limit) <= near for limit in best.limits(name))
 
 
 def _is_closed(best: BestPoint) -> bool:
@@ -303,18 +297,13 @@ def _estimates(
 def _correlation(best: BestPoint) -> Correlation:
     """Return the correlation of varied parameters, then of those given by expressions."""
     spread, problem = best.spread, best.problem
-    tied = tuple(name for name in problem.names if problem.params[name].expr)
-    if not tied:
-        return Correlation(best.names, spread.correlation, spread.stderr)
-    moves = problem.moves(best.values, best.names)[[problem.index[name] for name in tied]]
+    names = (*best.names, *(name for name in problem.names if problem.params[name].expr))
+    moves = problem.moves(best.values, best.names)[[problem.index[name] for name in names]]
     change = np.where(moves == 0.0, 0.0, moves * spread.stderr)  # by one standard error of each
-    shared = change @ np.nan_to_num(spread.correlation)
-    variances = shared @ change.T
-    stderr = np.sqrt(np.maximum(np.diag(variances), 0.0))
+    matrix = change @ np.nan_to_num(spread.correlation) @ change.T
+    stderr = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     with np.errstate(invalid="ignore", divide="ignore"):  # of one that depends on none of them
-        across, among = shared / stderr[:, None], variances / np.outer(stderr, stderr)
-    matrix = np.block([[spread.correlation, across.T], [across, among]])
-    return Correlation((*best.names, *tied), matrix, np.append(spread.stderr, stderr))
+        return Correlation(names, matrix / np.outer(stderr, stderr), stderr)
 
 
 def _of_tied(

@@ -70,16 +70,11 @@ def runs_test(residual: Array) -> float:
     """
     signs = residual[residual != 0.0] > 0.0
     n, positive = signs.size, int(np.count_nonzero(signs))
-    negative = n - positive
-    if n < 2:
-        return 1.0
-    if positive == 0 or negative == 0:
-        return math.ldexp(1.0, 1 - n)  # probability that n random signs are all the same
+    if positive in (0, n):
+        return min(math.ldexp(1.0, 1 - n), 1.0)  # probability that n random signs are all the same
     runs = 1 + int(np.count_nonzero(signs[1:] != signs[:-1]))
-    mean = 2.0 * positive * negative / n + 1.0
-    variance = (mean - 1.0) * (mean - 2.0) / (n - 1.0)
-    if variance <= 0.0:
-        return 1.0
+    mean = 2.0 * positive * (n - positive) / n + 1.0
+    variance = max((mean - 1.0) * (mean - 2.0) / (n - 1.0), 1e-300)  # 0 of two samples
     return float(special.ndtr((runs + 0.5 - mean) / math.sqrt(variance)))
 
 

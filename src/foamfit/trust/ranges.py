@@ -87,22 +87,15 @@ def left_open(
             found = refit.descend(refit.space.encode(point), refit.box, DESCENT)
             further.append(refit.values(found))
     values = np.array(points)[:, best.places] + 0.0  # turns -0 into 0
-    values = np.concatenate([values, _with_other_zeros(best)])
+    # With each held contact time or zero off by ± its error, to first order.
+    steps = best.answer(np.concatenate([best.shifts, -best.shifts], axis=1)).T
+    values = np.concatenate([values, np.clip(best.values[best.places] + steps, *best.box)])
     if best.friction is not None:
         values = np.concatenate([values, best.friction[1][None, best.places]])
     ends = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
     lower = best.cost - tracker.best_cost > BETTER * refit.least / ENOUGH
     better = tracker.best_values if lower else None
     return Open(dict(zip(best.names, ends, strict=True)), tuple(further), better)
-
-
-def _with_other_zeros(best: BestPoint) -> Array:
-    """Return the parameters with each held contact time or zero off by ± its error, (2 m, k).
-
-    To first order, within the limits of the parameters.
-    """
-    steps = best.answer(np.concatenate([best.shifts, -best.shifts], axis=1)).T
-    return np.asarray(np.clip(best.values[best.places] + steps, *best.box))
 
 
 def _held(refit: Refit, side: int, along: Array, most: float) -> list[Array]:

@@ -1,8 +1,9 @@
 """Common value and spread of a parameter between specimens, separated from estimation errors.
 
 The estimates u of n tests have errors of covariance C; the specimens scatter about a common value μ
-with a standard deviation τ: u ~ N(μ, C + τ²). τ maximises the restricted likelihood (REML), and μ
-is the generalised mean. `correlation` is that of several parameters between specimens.
+with a standard deviation τ: u ~ N(μ, C + τ²). μ is the generalised mean, and τ that at which the
+sum of squares Q(τ²) about it equals its expectation n-1 (Paule & Mandel 1982, J. Res. NBS 87, 377).
+`correlation` is that of several parameters between specimens.
 """
 
 from __future__ import annotations
@@ -13,12 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq
 
 from foamfit.arrays import Array
-
-SMALLEST = 1e-3  # lower limit of a nonzero spread, in units of the smallest error
-LARGEST = 100.0  # upper limit of a spread, in units of the standard deviation of the estimates
 
 
 @dataclass(frozen=True)
@@ -57,21 +55,9 @@ def common_and_spread(values: Array, errors: Array) -> Spread:
         """Return the sum of squares about the mean, in units of error plus spread."""
         return float(np.sum((seen - mean(tau2)[0] * ones) ** 2 / (variances + tau2)))
 
-    def criterion(tau2: float) -> float:
-        """Return minus twice the logarithm of the restricted likelihood."""
-        return float(np.sum(np.log(variances + tau2))) + math.log(mean(tau2)[1]) + q(tau2)
-
-    least = SMALLEST**2 * float(variances[0])
-    most = max(LARGEST**2 * float(np.var(values, ddof=1)), 2.0 * least)
-    grid = np.geomspace(max(least, 1e-9 * most), most, 40)
-    costs = [criterion(0.0), *map(criterion, grid)]
-    at, tau2, error = int(np.argmin(costs)), 0.0, None
-    if at > 0:
-        ends = (math.log(grid[max(at - 2, 0)]), math.log(grid[min(at, grid.size - 1)]))
-        best = minimize_scalar(
-            lambda u: criterion(math.exp(u)), bounds=ends, method="bounded", options={"xatol": 1e-8}
-        )
-        tau2 = math.exp(float(best.x)) if best.fun < costs[0] else 0.0
+    levels = (n - 1.0, *(float(stats.chi2.ppf(p, n - 1)) for p in (0.975, 0.025)))
+    most, error = max(float(np.var(values, ddof=1)), float(variances[0])), None
+    tau2, low, high = (_crossing(q, level, most) for level in levels)
     if tau2 > 0.0:  # the expected information on τ² is half the trace of PP
         weights = 1.0 / (variances + tau2)
         once, twice = (float(np.sum(weights**power * ones**2)) for power in (2, 3))
@@ -81,10 +67,7 @@ def common_and_spread(values: Array, errors: Array) -> Spread:
     middle, precision = mean(tau2)
     stderr = math.sqrt(q(tau2) / (n - 1) / precision)
     half = float(stats.t.ppf(0.975, n - 1)) * stderr
-    low, high = (
-        math.sqrt(_crossing(q, float(stats.chi2.ppf(p, n - 1)), most)) for p in (0.975, 0.025)
-    )
-    ci95, tau_ci95 = (middle - half, middle + half), (low, high)
+    ci95, tau_ci95 = (middle - half, middle + half), (math.sqrt(low), math.sqrt(high))
     return Spread(middle, stderr, ci95, math.sqrt(tau2), error, tau_ci95, n)
 
 
