@@ -298,6 +298,7 @@ def _assess(
                 break
             tracker.consider(made.better)
             settle.refine(problem, tracker)
+            settle.back_to_plain(problem, tracker)
         except SearchStoppedError:
             return found.best(), record, Intervals()
         best = found.best()

@@ -121,6 +121,7 @@ class Tracker:
     pulse: Callable[[], None] | None = None
     looked: Callable[[Array], None] | None = None
     ends: list[Array] = field(default_factory=list)
+    plain: tuple[Array, float] | None = None  # point and cost of plain least squares, if weighed
 
     def residual(self, values: Array) -> Array:
         """Return the residual of the objective; SearchStoppedError after the time limit."""

@@ -247,9 +247,11 @@ class BestPoint:
     def answer(self, change: Array) -> Array:
         """Return the steps (k, q), SI, of the k parameters after changes (n_data, q) of `residual`.
 
-        They are Gauss-Newton steps, zero along directions that the curves do not determine.
+        They are Gauss-Newton steps, zero along directions that the curves do not determine, and of
+        parameters at a limit.
         """
-        return -self.sizes[:, None] * (np.linalg.pinv(self.scaled, rcond=1e-10) @ change)
+        scaled = self.scaled * [not self.at_limits(name) for name in self.names]
+        return -self.sizes[:, None] * (np.linalg.pinv(scaled, rcond=1e-10) @ change)
 
     def added(self, curve: str, values: Array) -> Array:
         """Return the change of the residual by `values` added to a simulated curve, (n_data,)."""

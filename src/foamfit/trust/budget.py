@@ -30,7 +30,7 @@ from foamfit.springs.parameters import NUISANCE, unit_of
 from foamfit.text import listed
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import AT_LIMIT, SINGULAR, Ends
+from foamfit.trust.covariance import Ends
 
 # Largest relative change of a quantity for its derivative; curves have kinks where springs snap.
 STEP = 1e-4
@@ -83,13 +83,9 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
         (low, before), (high, after) = (_changed(best, quantity, by) for by in (-step, step))
     except SimulationError:
         return np.full(best.values.size, np.nan)
-    scaled = best.scaled.copy()
-    # Parameters at a limit stay there.
-    distance = np.abs(best.box - best.values[best.places]).min(axis=0, initial=np.inf)
-    scaled[:, distance <= AT_LIMIT * best.sizes] = 0.0
-    steps = -np.linalg.pinv(scaled, rcond=SINGULAR) @ (0.5 * (after - before))
-    rounding = ROUNDING * np.max(np.abs(steps), initial=0.0)
-    steps = np.where(np.abs(steps) > rounding, steps, 0.0) * best.sizes
+    steps = best.answer(0.5 * (after - before)[:, None])[:, 0]
+    rounding = ROUNDING * np.max(np.abs(steps / best.sizes), initial=0.0)
+    steps = np.where(np.abs(steps) > rounding * best.sizes, steps, 0.0)
     moves = problem.moves(best.values, best.names)
     return np.asarray((0.5 * (high - low) + moves @ steps) * (share / step))
 

@@ -61,10 +61,6 @@ class Refit:
         cuts = (best.quantiles**2 * best.spread.inflation)[column]  # rises at ends of intervals
         self.least = ENOUGH * float(np.min(cuts, where=np.isfinite(cuts), initial=1e300))
 
-    def residual(self, point: Array) -> Array | None:
-        """Return the residual at a point; None if the simulation fails."""
-        return self.tracker.possible(self.space.decode(point))
-
     def shifted(self, near: Iterate, value: float) -> Iterate | None:
         """Return a point with the held parameter at a value; the others follow from a point `near`.
 
@@ -75,7 +71,7 @@ class Refit:
         most = near.cost - near.expected(alone)
         for step in (*together, alone):
             point = np.clip(near.point + step, *np.where(self.held, value, self.box))
-            residual = self.residual(point)
+            residual = self.tracker.possible(self.space.decode(point))
             if residual is not None and (step is alone or float(residual @ residual) <= most):
                 return near.updated(point, residual) if np.any(point != near.point) else near
         return None

@@ -2,14 +2,15 @@
 
 An error of the law could be hidden by a wrong contact time or zero. Where it is larger than the
 noise, these stay where the record shows them (`keep_to_record`). Where the motion that drives is
-uncertain, the residual is weighed by its covariance once, at the optimum of plain least squares
-(`weigh_motion`).
+uncertain, the residual is weighed by its covariance once, at the optimum of plain least squares; a
+fit that then follows the record worse returns to that optimum (`weigh_motion`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -32,6 +33,8 @@ MINIMA, NEAR = 12, 1.5
 ITERATIONS, ENOUGH = 60, 1e-3  # of such a descent, and its relative gain at the end
 LEFT = 1e-6  # predicted gain of the sum of squares at which a refinement ends
 SHOWN = 3.0  # standard errors from the zero of the file, from which the fitted one is another
+# Largest RMS deviation from the record over that of plain least squares.
+WORSE = 1.05
 
 
 def refine(problem: Problem, tracker: Tracker) -> None:
@@ -188,10 +191,33 @@ def _misfit(problem: Problem, values: Array) -> float:
 def weigh_motion(problem: Problem, tracker: Tracker) -> None:
     """Weight the residual by the covariance due to the motion's own uncertainty, and refine.
 
-    The covariance is that at the optimum of plain least squares.
+    The covariance is that at the optimum of plain least squares, to which the fit returns if it
+    then follows the record worse.
     """
-    plain = tracker.best_values
-    if plain is not None and problem.objective.weigh_motion(plain):
-        tracker.best_values, tracker.best_cost = None, math.inf  # the weights have changed
-        tracker.consider(plain)
-        refine(problem, tracker)
+    plain, cost = tracker.best_values, tracker.best_cost
+    if plain is None or not problem.objective.weigh_motion(plain):
+        return
+    tracker.plain = plain, cost
+    tracker.best_values, tracker.best_cost = None, math.inf  # the weights have changed
+    tracker.consider(plain)
+    refine(problem, tracker)
+    back_to_plain(problem, tracker)
+
+
+def back_to_plain(problem: Problem, tracker: Tracker) -> None:
+    """Return to plain least squares if the best point follows the record more than 5 % worse.
+
+    Where both residuals are noise, the weighed one is right.
+    """
+    objective = problem.objective
+    if tracker.plain is None or objective.weighing is None or tracker.best_values is None:
+        return
+    values, cost = tracker.plain
+    residual = objective.plain(tracker.best_values)
+    if float(residual @ residual) <= WORSE**2 * cost:
+        return
+    unweighed = copy(objective)
+    unweighed.weighing = None
+    alone = replace(problem, objective=unweighed)
+    if errs(BestPoint(alone, values)) or errs(BestPoint(alone, tracker.best_values)):
+        objective.weighing, tracker.best_values, tracker.best_cost = None, values, cost

@@ -99,7 +99,7 @@ def noise_processes(
     is the part of the noise that it absorbed: orthogonal columns, each with the length of the root
     of the absorbed share along it.
     """
-    basis = basis_of(jacobian) if taken is None else taken
+    basis = basis_of(jacobian) if taken is None else _shortened(taken)
     curves = parts(sizes)
     sums, processes = [], []
     for part in curves:
@@ -123,6 +123,15 @@ def noise_processes(
             for process, seen, part, image in zip(processes, sums, curves, images, strict=True)
         ]
     return processes
+
+
+def _shortened(taken: Array) -> Array:
+    """Return columns q for which (I-qqᵀ)² leaves the same share of white noise as `taken`.
+
+    A share λ of the noise along a column is absorbed; 1-λ is the square of 1-λ'.
+    """
+    share = np.clip(np.sum(taken**2, axis=0), 1e-300, 1.0)
+    return np.asarray(taken * np.sqrt((1.0 - np.sqrt(1.0 - share)) / share))
 
 
 def _corrected(
