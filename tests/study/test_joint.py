@@ -343,3 +343,12 @@ def test_joint_json_has_how_parameters_vary_together(found):
     assert np.diag(matrix) == pytest.approx(1.0)
     assert read_source(found).changing == tuple(said["names"])
     np.testing.assert_allclose(read_source(found).together, matrix)
+
+
+def test_a_test_with_a_wrong_scale_of_the_force_is_named(tmp_path):
+    wrong = {name: 1.05 * SPRING[name] for name in ("k0", "kc", "sigma_plus", "sigma_minus")}
+    for i, rate in enumerate(RATES):
+        write_test(tmp_path, f"t{i}", rate=rate, seed=i, **(wrong if i == 1 else {}))
+    found = ff.joint(write_study(tmp_path, "\n".join(f'{name} = "shared"' for name in NAMES)))
+    (factor,) = re.findall(r"(?m)^t1 departs .* times ([\d.]+) ", "\n".join(found.warnings))
+    assert float(factor) == pytest.approx(1.0 / 1.05, rel=0.01)

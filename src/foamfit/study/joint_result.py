@@ -48,6 +48,9 @@ _INPUT = ("velocity", "impulse", "input")  # those about the record, contradicti
 _OF_A_SEARCH = ("ended", "agree")  # items of the checklist that apply only to a search
 # More than this share of χ², and this multiple of its share of samples, make a test dominant.
 DOMINANT, MORE = 0.5, 2.0
+# Least share of χ² that the scale of one test's force takes away if it is named; the next one takes
+# away less by the factor `MORE`.
+SCALED = 0.3
 MOST_ROWS = 60  # of the table of tests on the terminal
 SEVERAL_RATES = 1.5  # ratio of rates; those of nominally equal tests differ by a few percent
 
@@ -385,11 +388,19 @@ def _with_words(
     told |= {"rates": f"{min(rates):.3g} to {max(rates):.3g} 1/s" if rates else ""}
     told |= {"top": (first, top), "dominant": max(DOMINANT, MORE * top.n_data / fit.found.n_data)}
     told |= {"together": _span_of(fit.found.misfits), "alone": _span_of(alone.misfits)}
-    told |= {"n_vary": fit.found.n_vary}
+    told |= {"n_vary": fit.found.n_vary, "scaled": _scaled(result, fit)}
     warnings = sentences("joint_warnings", **told)
     status = "failed" if lost else "warnings" if warnings else "ok"
     said = sentences("joint_sentences", **told)
     return replace(result, status=status, warnings=warnings, sentences=said)
+
+
+def _scaled(result: JointResult, fit: JointFit) -> tuple[str, float, float] | None:
+    """Return the test whose scale of the force departs clearly most, the factor and its gain."""
+    scales = [(*fit.point.scale(t)[::-1], name) for t, name in enumerate(result.tests)]
+    (gain, factor, test), (second, *_) = sorted(scales, reverse=True)[:2]
+    clear = fit.point.uncertainty.errs and gain > SCALED and gain > MORE * second
+    return (test, factor, gain) if clear else None
 
 
 def _span_of(found: Sequence[dict[str, float | None]]) -> Ends | None:

@@ -47,6 +47,11 @@ _QUANTITIES = {
     "specimen_mass": ("specimen", "mass"),
     "striker_mass": ("striker", "mass"), "velocity": ("striker", "velocity"),
 }  # fmt: skip
+# Zero of a channel that scales with a quantity, and the power.
+_OF_ZEROS = {
+    "area": ("stress_zero", -1.0), "stress_scale": ("stress_zero", 1.0),
+    "striker_mass": ("stress_zero", 1.0), "displacement_scale": ("displacement_zero", 1.0),
+}  # fmt: skip
 
 
 def responses(best: BestPoint) -> dict[str, Array]:
@@ -87,7 +92,12 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
     rounding = ROUNDING * np.max(np.abs(steps / best.sizes), initial=0.0)
     steps = np.where(np.abs(steps) > rounding * best.sizes, steps, 0.0)
     moves = problem.moves(best.values, best.names)
-    return np.asarray((0.5 * (high - low) + moves @ steps) * (share / step))
+    change = (0.5 * (high - low) + moves @ steps) * (share / step)
+    zero, power = _OF_ZEROS.get(quantity, ("", 0.0))
+    if zero in best.index and (quantity != "striker_mass" or problem.measurement.braked):
+        # The zero in the file, to which the fitted one is added, scales with its channel.
+        change[best.index[zero]] += power * share * problem.origins[best.index[zero]]
+    return np.asarray(change)
 
 
 def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array]:

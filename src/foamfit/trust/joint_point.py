@@ -182,6 +182,22 @@ class JointPoint:
         own = self.uncertainty.blocks[test].axes[0]
         return np.asarray((own @ axes) * np.sqrt(np.clip(share, 0.0, 1.0)))
 
+    def scale(self, test: int) -> tuple[float, float]:
+        """Return the factor of a test's force that lowers the cost most, and the share it lowers.
+
+        It is a score test: a linear step of this factor and of all unknowns, without a further fit.
+        """
+        best, block, left = self.bests[test], self.uncertainty.blocks[test], self.uncertainty.lefts
+        curve = next((n for n in best.problem.objective.counted if n.startswith("stress")), None)
+        if curve is None:
+            return 1.0, 0.0
+        column = -best.added(curve, best.problem.objective.measured[curve])
+        taken = left[test].T @ (block.axes[0].T @ column)
+        free, slope = float(column @ column - taken @ taken), float(column @ best.residual)
+        if free <= 1e-6 * float(column @ column):
+            return 1.0, 0.0
+        return 1.0 - slope / free, slope**2 / free / max(self.found.cost, 1e-300)
+
     @cached_property
     def _undrawn(self) -> tuple[Array, Array]:
         """Covariance and inverse curvature without the pull to common values, SI, (m, m) each."""
