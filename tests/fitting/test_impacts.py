@@ -9,7 +9,6 @@ import foamfit as ff
 import rig
 from conftest import AREA, HEIGHT, assert_near, synthetic_impact, write_csv
 
-pytestmark = pytest.mark.usefixtures("without_hops")
 TOML = (
     '[specimen]\nheight = "1.2 mm"\narea = "20 mm^2"\n'
     '[striker]\nmass = "7 g"\nvelocity = "1.5 m/s"\ngravity = false\n'

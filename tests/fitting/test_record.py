@@ -10,7 +10,6 @@ import pytest
 import foamfit as ff
 from conftest import write_csv
 
-pytestmark = pytest.mark.usefixtures("without_hops")
 HEIGHT, AREA = 15e-3, 7.07e-4  # m, m²
 OFFSET, BIAS = 3.1e-3, 0.21e6  # zeros of motion, m, and stress, Pa, in the file
 TOML = f'[specimen]\nheight = "{HEIGHT} m"\narea = "{AREA} m^2"\n'

@@ -11,7 +11,6 @@ from conftest import assert_near, loop_measurement, write_csv
 from foamfit.data.measurement import Noise, Specimen
 from foamfit.report.summary import summary_text
 
-pytestmark = pytest.mark.usefixtures("without_hops")
 HEIGHT, SPECIMEN = 10e-3, Specimen(10e-3, 1e-4)
 TOML = '[specimen]\nheight = "10 mm"\narea = "1 cm^2"\n'
 BISTABLE = {

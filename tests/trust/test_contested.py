@@ -12,7 +12,6 @@ import records
 import rig
 from conftest import DATA, needs_data, run, without_pictures
 
-pytestmark = pytest.mark.usefixtures("without_hops")
 QUICK = {"starts": 2, "intervals": "local"}
 
 
