@@ -15,6 +15,7 @@ ROUNDED = 1e-12  # strain past an end that rounding explains, of a spring that m
 RISEN = 1e-9  # base stress over the largest stress above which its return to zero ends the contact
 MIDDLE = 0.6  # share of a step at which s.midway is the strain rate; 0.58 of an implicit step
 DIP = 0.3  # least strain rate within a step, over its variation, below which the rate may vanish
+AT_ONCE = 1e-9  # share of a step within which an event is at its start
 DIPS = 16  # pieces of a step in which it is searched for such a rate
 # Kinds of events: a branch ends at its upper or lower strain, a spring turns, contact ends. Then a
 # greatest and a least strain.
@@ -104,18 +105,40 @@ def _root(c, low, high, i, kind):
 
 
 @inner
+def _locate(c, low, high, i, kind):
+    """Return where an excess becomes positive between two shares.
+
+    A spring that begins at an end of its branch may be past it by rounding and yet move away from
+    it. Then the event is where it returns.
+    """
+    there = _root(c, low, high, i, kind)
+    if kind >= TURN or there - low > AT_ONCE * (high - low):
+        return there
+    part = AT_ONCE * (high - low)
+    while part < 0.5 * (high - low):
+        part *= 4.0
+        look(c, low + part)
+        value = _excess(c, i, kind)
+        if value < -ROUNDED:
+            return _root(c, low + part, high, i, kind)
+        if value > ROUNDED:
+            break
+    return there
+
+
+@inner
 def _earliest(c, before, share):
     """Return the first of the events in (before, share] whose effect is seen at the end."""
     found, who, what = share, -1 + c.none, -1 + c.none
     look(c, found)
     if c.now.pressed > 0.0 and c.carried[0] <= 0.0:
         who, what = c.none, RELEASE + c.none
-        found = _root(c, before, found, who, what)
+        found = _locate(c, before, found, who, what)
         look(c, found)
     for i in range(c.count):
         for kind in range(RELEASE):
             if found > before and _happened(c, i, kind):
-                there = _root(c, before, found, i, kind)
+                there = _locate(c, before, found, i, kind)
                 if who < 0 or there < found:
                     found, who, what = there, i, kind
                 look(c, found)
@@ -149,7 +172,7 @@ def first_event(c):
             s = spring(c, i)
             look(c, share)
             if _may_pass(s, (share - before) * c.now.step):
-                turn = _root(c, before, share, i, TOP_TURN if s.rate < 0.0 else LOW_TURN)
+                turn = _locate(c, before, share, i, TOP_TURN if s.rate < 0.0 else LOW_TURN)
                 found, who, what = _earliest(c, before, turn)
                 if who >= 0:
                     return found, who, what
