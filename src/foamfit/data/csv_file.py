@@ -182,7 +182,7 @@ def _record(channels: Channels, settings: Settings) -> Record:
         entry = entries_of(channels.source.table, set(), "time")
         if settings.striker is not None or "…" not in entry:
             notes.append(f"Check: {said}; name the time in [columns], like {entry}.")
-    stress = _one_of(numbers, "stress", "force", specimen.area, "the area", notes)
+    stress = _one_of(numbers, "stress", "force", specimen.area, "area", notes)
     displacement = _one_of(numbers, "displacement", "strain", 1 / specimen.height, "height", notes)
     acceleration = numbers.get("acceleration")
     time, velocity, braked = numbers.get("time"), numbers.get("velocity"), stress is None
@@ -262,12 +262,12 @@ def _one_of(
         return one
     if one is None:
         operation = "over" if first == "stress" else "times"
-        notes.append(f"The {first} is the {second} {operation} {by}.")
+        notes.append(f"The {first} is the {second} {operation} the {by}.")
         return two / ratio
     slope = float(np.dot(two, one) / np.dot(one, one)) / ratio
     apart = percent(max(1e-5, float(np.max(np.abs(two / ratio - one)) / np.ptp(one))))
     if abs(slope - 1) > 0.03:
-        agree = f"{slope:.3g} times its equivalent with {by} of the specimen; they are inconsistent"
+        agree = f"{slope:.3g} times its equivalent with the specimen's {by}; they are inconsistent"
         notes.append(f"Check: the {first} is used, but the {second} is {agree}.")
     else:
         used = f"The {first} is used rather than the {second}"
