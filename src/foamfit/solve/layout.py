@@ -157,12 +157,9 @@ def lay_out(shape: Shape) -> tuple[NDArray[np.int64], int]:
         "systems": 2 * run.SYSTEMS * size * (3 * reach + 1),
         "right": 2 * run.SYSTEMS * size,
     }  # fmt: skip
-    named = [*([i, what] for i in range(count) for what in (OWN_HEIGHT, OWN_ETA)), [-1, DRAG]]
-    own = np.array([float(one == other) for one in named for other in directions])
     arrays = (
-        numbers.view(np.int64).tolist(), [0, *shape.ends], [k for pair in directions for k in pair],
-        [what if k == i else -1 for i in range(count) for k, what in directions],
-        own.view(np.int64).tolist(), kinds, [0] * (run.SYSTEMS * size), places, groups_of[:size],
+        numbers.view(np.int64).tolist(), [0, *shape.ends], *_owners(directions, count), kinds,
+        [0] * (run.SYSTEMS * size), places, groups_of[:size],
     )  # fmt: skip
     at = np.cumsum([0, *(lengths[name] for name in run.FLOATS)])
     whole = np.cumsum([run.WORDS, *map(len, arrays)])
@@ -175,6 +172,14 @@ def lay_out(shape: Shape) -> tuple[NDArray[np.int64], int]:
         int(shape.solved), wide, shape.degree, reach, 0, 0, 0, 0,
     ]  # fmt: skip
     return np.array([*words, *(k for one in arrays for k in one)], np.int64), int(at[-1])
+
+
+def _owners(directions: list[list[int]], count: int) -> tuple[list[int], list[int], list[int]]:
+    """Return the directions, what each is of each spring, and own derivatives; see `INTEGERS`."""
+    named = [*([i, what] for i in range(count) for what in (OWN_HEIGHT, OWN_ETA)), [-1, DRAG]]
+    own = np.array([float(one == other) for one in named for other in directions])
+    owned = [what if k == i else -1 for i in range(count) for k, what in directions]
+    return [k for pair in directions for k in pair], owned, own.view(np.int64).tolist()
 
 
 def memory_of(shape: Shape) -> Memory:

@@ -358,22 +358,13 @@ def _rows_of_numbers(
     usual = table.decimal == "." and body.isascii() and "_" not in body
     for row, cells in table.rows():
         if usual and len(cells) == width and not below:
-            try:
-                values = [float(cells[k]) for k in places]
-            except ValueError:
-                values = [math.nan]
+            values = _plain_numbers(cells, places)
             if math.isfinite(sum(values)):
                 numbers.extend(values)
                 rows.append(row)
                 continue
         cells = _of_header(table, row, cells)
-        if all(cells[k].lower() in _MISSING for k in measured):
-            filled = [cell for cell in cells if cell.lower() not in _MISSING]
-            if len(filled) == 1 and _is_sample(re.split(r"[\s;|,]+", filled[0])):
-                raise InputError(
-                    f"row {row} has its numbers in one cell, {filled[0][:LONGEST]!r}; all rows "
-                    "must have the separator of the header and closed quotation marks."
-                )
+        if _is_empty(row, cells, measured):
             empty.append(row)
             continue
         clock = _CLOCK.fullmatch(cells[columns["time"]]) if "time" in columns else None
@@ -397,6 +388,27 @@ def _rows_of_numbers(
     read = np.array(numbers).reshape(-1, len(places)).T.copy()
     dropped = {"no numbers in the columns in use": empty, "a remark below the table": remarks}
     return read, np.array(rows), [Dropped.of(np.array(n), why) for why, n in dropped.items() if n]
+
+
+def _plain_numbers(cells: Sequence[str], places: Sequence[int]) -> list[float]:
+    """Return the numbers of a row as Python reads them; NaN if one is none."""
+    try:
+        return [float(cells[k]) for k in places]
+    except ValueError:
+        return [math.nan]
+
+
+def _is_empty(row: int, cells: Sequence[str], measured: Sequence[int]) -> bool:
+    """Return whether no measured column has a cell; InputError if all numbers are in one."""
+    if not all(cells[k].lower() in _MISSING for k in measured):
+        return False
+    filled = [cell for cell in cells if cell.lower() not in _MISSING]
+    if len(filled) == 1 and _is_sample(re.split(r"[\s;|,]+", filled[0])):
+        raise InputError(
+            f"row {row} has its numbers in one cell, {filled[0][:LONGEST]!r}; all rows must have "
+            "the separator of the header and closed quotation marks."
+        )
+    return True
 
 
 def _seconds(hours: str | None, minutes: str, seconds: str, half: str | None) -> float:
