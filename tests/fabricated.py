@@ -8,11 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from foamfit.api import FitResult
-from foamfit.data.measurement import ASKED, Measurement, Specimen, Striker
+from foamfit.data.measurement import Measurement, Specimen, Striker
 from foamfit.parts import ParameterEstimate
 from foamfit.results import SOURCES, Budget, Curves, Switch
 from foamfit.springs.chain import Chain
 from foamfit.springs.laws import BistableSpring, LinearSpring, MicroscaleSpring
+from foamfit.text import ASKED
 from foamfit.trust.checklist import input_first
 
 HEIGHT, AREA = 1.19e-3, 1.9635e-5

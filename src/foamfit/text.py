@@ -12,6 +12,7 @@ from decimal import Decimal
 
 # Line length, characters: that of the terminal, within these limits.
 WIDTH, NARROWEST = 100, 40
+ASKED = "Check:"  # starts a note about a probable error in the input
 COLUMN = 10  # column in which the text after a label begins
 _NO_BREAK = "\u00a0"  # no-break space
 _PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "µ": 1e-6, "n": 1e-9}
@@ -145,7 +146,7 @@ def option_value(value: object) -> str:
 
 def warning(text: str) -> str:
     """Write a warning with its label, which replaces the word with which a note asks to check."""
-    return f"warning: {text.removeprefix('Check: ')}"
+    return f"warning: {text.removeprefix(ASKED).lstrip()}"
 
 
 def line_width() -> int:

@@ -98,7 +98,8 @@ def choose_cycles(cycles: list[Cycle], number: int | None, last: int | None) -> 
     end = _choose(cycles, last) if len(cycles) > 1 else None
     if first is None or end is None or end.place <= first.place:
         wrong = f"cycles {number} to {last} cannot be taken"
-        raise InputError(f"{wrong}: the record has no such cycles in this order; name others.")
+        why = "the record has no such cycles in this order; foamfit check says how many it has"
+        raise InputError(f"{wrong}: {why}.")
     return replace(first, end=end.end, last=end.number, turn=end.top)
 
 

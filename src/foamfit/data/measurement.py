@@ -15,7 +15,6 @@ from foamfit.text import engineering, rounded
 
 MIN_ROWS = 10  # samples of a test
 
-ASKED = "Check:"  # starts a note about a probable error in the input
 
 # Sources of a displacement; an integrated one is not an independent measurement.
 MEASURED, INTEGRATED = "measured", "integrated from force"

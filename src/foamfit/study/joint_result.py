@@ -14,7 +14,6 @@ import numpy as np
 from foamfit.api import FitResult
 from foamfit.arrays import Array
 from foamfit.codec import plain
-from foamfit.data.measurement import ASKED
 from foamfit.fitting.links import RATES
 from foamfit.fitting.search import SearchRecord
 from foamfit.fitting.together import Together
@@ -32,7 +31,7 @@ from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.joint_fit import LARGEST, JointFit, parameters_of
 from foamfit.study.study_file import Study
-from foamfit.text import counted, number, readable_unit
+from foamfit.text import ASKED, counted, number, readable_unit
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.checklist import misfits_of, status_of, warnings_of
 from foamfit.trust.conclude import conclude

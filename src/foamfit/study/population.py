@@ -42,6 +42,10 @@ class Population:
                 f"{'of the test' if self.rate is None else 'rate0 of the result'} is not known; "
                 "give a time and a displacement column, or rate0 in joint.json"
             )
+        own = (one for name in self.scattering if (one := self._parameters[name]).kind == "own")
+        if len({tuple(one.tests or ()) for one in own}) > 1:
+            why = f"{self.source.where}: all own parameters must have values for the same tests"
+            raise InputError(why)
 
     @property
     def _parameters(self) -> dict[str, ParameterEstimate]:

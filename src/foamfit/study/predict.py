@@ -14,7 +14,7 @@ from foamfit.arrays import Array, single_threaded
 from foamfit.data.calibration import contradictions
 from foamfit.data.csv_file import read_test
 from foamfit.data.cycles import cycles_of, loading_rate
-from foamfit.data.measurement import ASKED, Measurement
+from foamfit.data.measurement import Measurement
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError, check_whole
 from foamfit.fitting import curves
@@ -29,6 +29,7 @@ from foamfit.report.studies.prediction import COLOURS, PredictedCurve, Predictio
 from foamfit.springs.parameters import NUISANCE, unit_of
 from foamfit.study.identified import NORMAL, Source, read_source
 from foamfit.study.population import Population
+from foamfit.text import ASKED
 from foamfit.trust import say
 
 DRAWS = 400  # default number of draws of specimens

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from foamfit.data.energy import EnergyAudit
-from foamfit.data.measurement import ASKED, INTEGRATED, is_clipped
+from foamfit.data.measurement import INTEGRATED, is_clipped
 from foamfit.data.zeros import CONTRADICTED
 from foamfit.errors import InputError
 from foamfit.fitting.branches import covered, visited
@@ -24,6 +24,7 @@ from foamfit.fitting.search import SearchRecord, Tracker, squares
 from foamfit.parts import ParameterEstimate
 from foamfit.results import Check, Intervals
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
+from foamfit.text import ASKED
 from foamfit.trust import SENTENCES, say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import WEAK, covariance

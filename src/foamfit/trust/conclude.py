@@ -202,8 +202,9 @@ def _inner_loops(best: BestPoint) -> dict[str, Any] | None:
         inside[first:stop] = True
         ends = [first, min(stop, curve.size - 1)]
         clock = ends if test.time is None else test.time[ends].tolist()
-        unit = "" if test.time is None else "s"
-        spans.append("from {} to {}".format(*(engineering(at, unit) for at in clock)))
+        word, unit = ("sample ", "") if test.time is None else ("", "s")
+        start, end = (engineering(at, unit) for at in clock)
+        spans.append(f"from {word}{start} to {end}")
     if not spans or not (total := float(squares.sum())) > 0.0:
         return None
     shares = {"samples": float(inside.mean()), "squares": float(squares[inside].sum()) / total}

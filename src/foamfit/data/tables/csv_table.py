@@ -391,7 +391,7 @@ def _rows_of_numbers(
 
 
 def _plain_numbers(cells: Sequence[str], places: Sequence[int]) -> list[float]:
-    """Return the numbers of a row as Python reads them; NaN if one is none."""
+    """Return the numbers of a row, or NaN if one of its cells is not a number."""
     try:
         return [float(cells[k]) for k in places]
     except ValueError:
@@ -399,7 +399,7 @@ def _plain_numbers(cells: Sequence[str], places: Sequence[int]) -> list[float]:
 
 
 def _is_empty(row: int, cells: Sequence[str], measured: Sequence[int]) -> bool:
-    """Return whether no measured column has a cell; InputError if all numbers are in one."""
+    """Return whether a row has no measured value; InputError if one cell has all its numbers."""
     if not all(cells[k].lower() in _MISSING for k in measured):
         return False
     filled = [cell for cell in cells if cell.lower() not in _MISSING]
