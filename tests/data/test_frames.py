@@ -203,6 +203,10 @@ def test_a_motion_is_no_test_of_its_own(tmp_path):
         ),
         (COLUMNS + 'force = { column = "F" }\n', ["[motion.columns] has no key 'force'"]),
         (
+            COLUMNS + 'velocity = { column = "v" }\n',
+            ["no key 'velocity'; its keys are time, displ"],
+        ),
+        (
             COLUMNS + 'displacement = { column = "x" }\n',
             ["camera.csv: [motion.columns] displacement: column 'x' is nowhere"],
         ),

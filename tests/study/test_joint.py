@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -297,7 +298,7 @@ def test_the_command_writes_and_prints(folder, tmp_path, monkeypatch):
         ('s1_k0 = "share"', "", "s1_k0 = 'share' must be one of shared, own, scatter"),
         ('s1_k0 = "shared"', 'drive = "pull"', "drive = 'pull' must be one of impact"),
         ('s1_k0 = "shared"', "seed = -1", "seed = -1 must be a whole number from 0 up"),
-        ('s1_k0 = "shared"', "sead = 1", "has no key 'sead'; meant may be seed"),
+        ('s1_k0 = "shared"', "sead = 1", "has no key 'sead'; did you mean 'seed' or 'starts'?"),
         ('s1_k0 = "shared"', 'tests = ["u*.csv"]', "u*.csv: the glob matches no file"),
         ('s1_k0 = "shared"', 'tests = ["t0.csv"]', "a joint fit needs at least two"),
         ('s1_k0 = "shared"', 'model = "microscale+x"', "'x' is not a spring"),
@@ -352,3 +353,15 @@ def test_a_test_with_a_wrong_scale_of_the_force_is_named(tmp_path):
     found = ff.joint(write_study(tmp_path, "\n".join(f'{name} = "shared"' for name in NAMES)))
     (factor,) = re.findall(r"(?m)^t1 departs .* times ([\d.]+) ", "\n".join(found.warnings))
     assert float(factor) == pytest.approx(1.0 / 1.05, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("factor", "named"), [(1.3, True), (0.7, True), (-7.5, False), (3.0, False)]
+)
+def test_a_scale_to_first_order_is_said_only_near_one(factor, named):
+    point = SimpleNamespace(
+        uncertainty=SimpleNamespace(errs=True), scale=lambda t: [(factor, 0.8), (1.0, 0.1)][t]
+    )
+    result = SimpleNamespace(tests={"a": None, "b": None})
+    found = joint_report._scaled(result, SimpleNamespace(point=point))
+    assert found == (("a", factor, 0.8) if named else None)

@@ -168,8 +168,10 @@ def check_keys(where: str, given: Iterable[str], valid: Iterable[str]) -> None:
     for key in given:
         if key not in valid:
             key = key[:LONGEST]
-            near = difflib.get_close_matches(key, valid, n=2, cutoff=0.4) or valid
-            raise InputError(f"{where} has no key {key!r}; meant may be {', '.join(near)}.")
+            near = difflib.get_close_matches(key, valid, n=2, cutoff=0.4)
+            meant = f"did you mean {' or '.join(map(repr, near))}?"
+            remedy = meant if near else f"its keys are {', '.join(valid)}."
+            raise InputError(f"{where} has no key {key!r}; {remedy}")
 
 
 def table_of(document: Mapping[str, Any], name: str, within: str = "") -> dict[str, Any]:
@@ -249,7 +251,7 @@ _SCALE = "4444.4 N/V"
 # Keys of TOML files that may lie beside a test with their name
 _OTHERS = {"tests": "a study of several tests", "chain": "a scene", "machine": "a rig"}
 # Channels of a [motion] file, in addition to displacements of interior masses.
-MOTION_CHANNELS = "time", "displacement", "strain", "velocity"
+MOTION_CHANNELS = "time", "displacement", "strain"
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,8 @@ _OF_A_SEARCH = ("ended", "agree")  # items of the checklist that apply only to a
 # More than this share of χ², and this multiple of its share of samples, make a test dominant.
 DOMINANT, MORE = 0.5, 2.0
 # Least share of χ² that the scale of one test's force takes away if it is named; the next one takes
-# away less by the factor `MORE`.
-SCALED = 0.3
+# away less by the factor `MORE`. A step to first order says nothing of a scale further from 1.
+SCALED, FURTHEST = 0.3, 2.0
 MOST_ROWS = 60  # of the table of tests on the terminal
 SEVERAL_RATES = 1.5  # ratio of rates; those of nominally equal tests differ by a few percent
 
@@ -399,7 +399,7 @@ def _scaled(result: JointResult, fit: JointFit) -> tuple[str, float, float] | No
     scales = [(*fit.point.scale(t)[::-1], name) for t, name in enumerate(result.tests)]
     (gain, factor, test), (second, *_) = sorted(scales, reverse=True)[:2]
     clear = fit.point.uncertainty.errs and gain > SCALED and gain > MORE * second
-    return (test, factor, gain) if clear else None
+    return (test, factor, gain) if clear and 1.0 / FURTHEST < factor < FURTHEST else None
 
 
 def _span_of(found: Sequence[dict[str, float | None]]) -> Ends | None:
