@@ -18,6 +18,7 @@ def ranged(low: float, high: float, unit: str = "Pa") -> str:
     ("made", "text"),
     [
         (t.engineering(3.839e6, "Pa"), "3.839 MPa"),
+        (t.engineering(-1.735e-18, "m"), "−1.735e−09 nm"),
         (t.engineering(999960.0, "Pa"), "1 MPa"),
         (t.engineering(0.0, "m"), "0 m"),
         (t.engineering(-2e-6, "m"), "−2 µm"),
@@ -76,3 +77,9 @@ def test_text_and_tables_fit_the_terminal(
     assert max(map(len, [*lines, *t.wrapped("word " * 60)])) <= most
     assert sum(line.count("1234567 MPa") for line in lines) == 20
     assert all(line.startswith(("parameter", "k0", "kc")) for line in lines if line)
+
+
+@pytest.mark.parametrize(("systematic", "shown"), [(7.6e-4, ""), (7.6e4, "0.076")])
+def test_a_systematic_error_of_the_size_of_rounding_is_not_shown(systematic, shown):
+    estimate = fabricated.estimate("s1_k0", 3.8e6, unit="Pa", systematic=systematic)
+    assert readable("s1_k0", estimate).systematic == shown

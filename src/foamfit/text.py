@@ -40,10 +40,12 @@ def readable_unit(size: float, unit: str) -> tuple[float, str]:
 def engineering(value: float, unit: str, error: float = 0.0) -> str:
     """Write a value with four digits and a prefix: 3.839e6, "Pa" gives "3.839 MPa".
 
-    With a standard error both are rounded to two digits of it: "3.839 ± 0.012 MPa".
+    With a standard error both are rounded to two digits of it: "3.839 ± 0.012 MPa". Far below the
+    smallest prefix the number has an exponent.
     """
     factor, name = readable_unit(float(f"{max(abs(value), error):.3e}"), unit)
-    shown = significant(value / factor, 4).replace("-", "−")
+    plain = value == 0.0 or abs(value) >= 1e-3 * factor
+    shown = significant(value / factor, 4).replace("-", "−") if plain else number(value / factor)
     if error:
         shown = " ± ".join(with_error(value / factor, error / factor)[:2])
     return f"{shown} {name}".rstrip()

@@ -77,7 +77,8 @@ def readable(name: str, p: ParameterEstimate, given: tuple[float, str] | None = 
         if p.ci95 is not None:
             interval = " to ".join(fixed(bound / factor, places) for bound in p.ci95)
     span = "" if p.range is None else _span(p.range, p.unit, factor)
-    scale = f"{p.systematic / factor:.2g}" if p.systematic else ""
+    least = NOTHING * max(sizes)  # what is less comes from rounding
+    scale = f"{p.systematic / factor:.2g}" if p.systematic and p.systematic > least else ""
     rest = (p.state, p.why, p.ci95_method or "", span, scale)
     return Readable(name, symbol(name), shown, stderr, interval, unit or "–", *rest)
 
