@@ -287,6 +287,8 @@ def _assess(
             better = None
             # Ranges of the previous point are not valid here.
             if choice.ranges and best.cost < MOVED * cost_of_ranges:
+                if record.led and best.misfits:
+                    _hop(problem, tracker, best, record.seed)
                 other = choice.method != "local"  # local intervals belong to this minimum
                 left = left_open(best, tracker.ends, tracker, budget, other)
                 better, cost_of_ranges = left.better if other else None, best.cost
@@ -307,6 +309,16 @@ def _assess(
     return best, record, replace(made, better=None, ranges=left.ranges)
 
 
+def _hop(problem: Problem, tracker: Tracker, best: BestPoint, seed: int) -> None:
+    """Hop between minima of springs in series for the ranges, if the search has not done that."""
+    if problem.model.has_several and not tracker.met:
+        thinned = problem.thinned()
+        coarse = Tracker(thinned.objective, tracker.deadline, met=tracker.met, pulse=tracker.pulse)
+        coarse.consider(best.values)
+        coarse.ends = [best.values, *tracker.ends]
+        search.leave_minimum(coarse, problem.space(), np.random.default_rng(seed), search.SHORT)
+
+
 def _search(
     begun: Found, asked: Collection[str], given: Collection[str], progress: Progress,
     known: Sequence[Array],
@@ -320,7 +332,10 @@ def _search(
     problem, tracker, record = begun.problem, begun.tracker, begun.record
     rng, early = np.random.default_rng(record.seed), list[Array]()
     thinned, impact = problem.thinned(), problem.objective.drive == "impact"
-    coarse = Tracker(thinned.objective, tracker.deadline, tracker.better, looked=tracker.looked)
+    coarse = Tracker(
+        thinned.objective, tracker.deadline, tracker.better,
+        looked=tracker.looked, met=tracker.met,
+    )  # fmt: skip
 
     def search_thinned(problem: Problem) -> tuple[list[tuple[float, int]], list[Array]]:
         """Search on the thinned record; return the costs and ends of its descents."""

@@ -24,7 +24,7 @@ from foamfit.report.readable import readable
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import RULE, Block, Uncertainty, covariance
 from foamfit.trust.profile import Refit
-from foamfit.trust.ranges import ALIKE, alike, left_open, tolerance
+from foamfit.trust.ranges import ALIKE, ends_alike, left_open, refits_alike, tolerance
 from foamfit.trust.residuals.law_error import curve_errors
 from foamfit.trust.residuals.noise_process import NoiseProcess
 
@@ -210,7 +210,8 @@ def test_the_interval_holds_the_best_fit_without_noise(kind):
 def test_every_description_in_the_range_follows_the_curves_about_as_well():
     result, best, found = fitted(0)
     assert best.misfits
-    points = alike(best, found.tracker.ends, found.tracker)
+    points = ends_alike(best, found.tracker.ends, found.tracker)
+    points += refits_alike(best, found.tracker, np.inf)
     costs = [float(np.sum(best.problem.objective.residual(point) ** 2)) for point in points]
     law = sum(n * e.law**2 for e, n in zip(best.errors, best.problem.objective.sizes, strict=True))
     assert tolerance(best) == pytest.approx((ALIKE**2 - 1.0) * law)

@@ -43,6 +43,7 @@ SHORT, LONG, LOST, MINIMA = 40, 160, 30.0, 24
 STAGES = ((8, 0.5, 0.5), (8, 0.25, 0.25), (24, 0.25, 0.25))
 HALFWAY = STAGES[0][2]
 LEAST = 6  # descents that go on in any case
+NEAR = 1.5  # largest cost over the best one of an end that may fit almost as well
 
 
 class SearchStoppedError(Exception):
@@ -108,9 +109,10 @@ def _agreeing(ends: Sequence[tuple[float, int]]) -> int:
 class Tracker:
     """Evaluates an objective within a time limit, and keeps the best point.
 
-    `ends` are the end points of the descents on the curves. `better` is called with each new best
-    point, `pulse` every `PULSE` evaluations, and `looked` with the best point of the first
-    descents; an exception from `looked` ends the fit.
+    `ends` are the end points of the descents on the curves, and `met` those of springs in series,
+    hops included, that are at most `NEAR` times as costly as the best one. `better` is called with
+    each new best point, `pulse` every `PULSE` evaluations, and `looked` with the best point of the
+    first descents; an exception from `looked` ends the fit.
     """
 
     objective: Objective
@@ -121,6 +123,7 @@ class Tracker:
     pulse: Callable[[], None] | None = None
     looked: Callable[[Array], None] | None = None
     ends: list[Array] = field(default_factory=list)
+    met: list[Array] = field(default_factory=list)
     plain: tuple[Array, float] | None = None  # point and cost of plain least squares, if weighed
 
     def residual(self, values: Array) -> Array:
@@ -278,8 +281,16 @@ def leave_minimum(
     chains = alike(space.model, tracker.best_values)
     ends += halve(functions, space.box, [space.encode(values) for values in chains])
     every = hop(space, ends, functions, rng, patience=patience)
+    if space.model.has_several:  # of one spring, refits near the best point show what is open
+        tracker.met += _near(space, every)
     tracker.ends = [space.decode(group[0][1]) for group in grouped(every, ALIKE)[:MINIMA]]
     return [(cost, 1) for cost, _ in every[len(ends) :]]
+
+
+def _near(space: Space, ends: list[tuple[float, Array]]) -> list[Array]:
+    """Return the parameters of the ends that may fit almost as well as the best one."""
+    most = NEAR * min((cost for cost, _ in ends), default=math.inf)
+    return [space.decode(point) for cost, point in ends if cost <= most]
 
 
 def _settled(
@@ -339,6 +350,7 @@ def _search_loop(
         if own.model.has_several and not own.model.relaxation:
             ends = hop(own, ends, squares(inner, own), rng)
         ends = [(cost, space.encode(own.decode(end))) for cost, end in ends]
+        tracker.met += _near(space, ends)
     finally:
         if inner.best_values is not None:
             tracker.consider(inner.best_values)

@@ -8,13 +8,14 @@ about as well, among them one with friction in the rig if the residuals show it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
 
 from foamfit.arrays import Array
+from foamfit.fitting.minima import in_order
 from foamfit.fitting.search import Tracker
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.profile import BETTER, ENOUGH, Refit
@@ -34,26 +35,28 @@ def tolerance(best: BestPoint, errors: Sequence[CurveError] | None = None) -> fl
     return (ALIKE**2 - 1.0) * missed
 
 
-def alike(
-    best: BestPoint, minima: Sequence[Array], tracker: Tracker, budget: float = math.inf
-) -> list[Array]:
-    """Return points that fit almost as well as the best point, which is the first of them.
+def ends_alike(best: BestPoint, minima: Sequence[Array], tracker: Tracker) -> list[Array]:
+    """Return the ends of descents (`minima`) and of hops that fit almost as well as the best point.
 
-    They are the ends of the search's descents (`minima`), and refits with each parameter fixed as
-    far from the best point as possible, starting from the linear prediction. After `budget`
-    evaluations no further refit is begun.
+    Their springs are in order.
     """
-    most, allowed = tolerance(best), tracker.objective.evaluations + budget
-    out = [best.values]
-    for point in minima:
+    most, space, out = tolerance(best), best.problem.space(), list[Array]()
+    for point in (*minima, *(space.decode(space.encode(met)) for met in tracker.met)):
         residual = tracker.possible(point)
         if residual is not None and float(residual @ residual) - best.cost <= most:
-            out.append(point)
+            out.append(in_order(space, tracker.objective, point))
+    return out
+
+
+def refits_alike(best: BestPoint, tracker: Tracker, allowed: float) -> Iterator[Array]:
+    """Refit with each parameter fixed as far as a point still fits almost as well as the best one.
+
+    The refits start from the linear prediction. After `allowed` evaluations none is begun.
+    """
     inverse = np.linalg.pinv(best.scaled.T @ best.scaled, rcond=1e-12, hermitian=True)
     for (name, along), side in product(zip(best.names, inverse, strict=True), (0, 1)):
         if tracker.objective.evaluations < allowed:
-            out += _held(Refit(best, tracker, name), side, along * best.sizes, most)
-    return out
+            yield from _held(Refit(best, tracker, name), side, along * best.sizes, tolerance(best))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,21 +75,22 @@ def left_open(
     budget: float = math.inf,
     descents: bool = True,
 ) -> Open:
-    """Find the ranges of the parameters, and nearby minima that the search missed; see `alike`.
+    """Find the ranges of the parameters, and nearby minima that the search missed.
 
-    Without `descents`, which are half to two thirds of the work, these minima are not computed.
+    The ranges are those of `ends_alike` and `refits_alike`. Without `descents`, which are half to
+    two thirds of the work, these minima are not computed.
     """
     if not best.misfits:
         return Open()
+    points = [best.values, *ends_alike(best, minima, tracker)]
     allowed = tracker.objective.evaluations + budget
-    points = alike(best, minima, tracker, budget)
+    refits = list(refits_alike(best, tracker, allowed))
     refit, further = Refit(best, tracker), list[Array]()
-    for point in points[1:] if descents else ():
-        new = not any(point is other for other in minima)
-        if new and tracker.objective.evaluations < allowed:
+    for point in refits if descents else ():
+        if tracker.objective.evaluations < allowed:
             found = refit.descend(refit.space.encode(point), refit.box, DESCENT)
             further.append(refit.values(found))
-    values = np.array(points)[:, best.places] + 0.0  # turns -0 into 0
+    values = np.array([*points, *refits])[:, best.places] + 0.0  # turns -0 into 0
     # With each held contact time or zero off by ± its error, to first order.
     steps = best.answer(np.concatenate([best.shifts, -best.shifts], axis=1)).T
     values = np.concatenate([values, np.clip(best.values[best.places] + steps, *best.box)])
