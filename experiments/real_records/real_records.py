@@ -1,13 +1,15 @@
 """Does a fit of a real record accept what the record itself excludes?
 
-Method and answer: README.md. Also written: loops.csv.
+Method and answer: README.md. Also written: loops.csv and halves.csv.
 
     FOAMFIT_DATA=… python experiments/real_records/real_records.py   # minutes; --page: table alone
 """
 
 import math
+import shutil
 import sys
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -171,18 +173,38 @@ def compared(folder: Path) -> Iterator[dict[str, object]]:
             }  # fmt: skip
 
 
+def halves(folder: Path) -> Iterator[dict[str, object]]:
+    """Yield whether each value of one half of the rows lies in the range of the other half."""
+    more = LAWS | {"two bistable": ("bistable+bistable", 0)}
+    for name, (law, (model, terms)) in product(records.SHOE_FOAM, more.items()):
+        path, fits = records.place(name, folder), list[ff.FitResult]()
+        for i in range(2):
+            half = folder / f"half-{i}.csv"
+            pd.read_csv(path)[i::2].to_csv(half, index=False)
+            shutil.copy(path.with_suffix(".toml"), half.with_suffix(".toml"))
+            fits.append(ff.fit(ff.read_test(half), model=model, relaxation=terms))
+        for one, other in (fits, fits[::-1]):
+            for key, item in one.parameters.items():
+                if key.startswith("s") and item.range and other.parameters[key].vary:
+                    inside = item.range[0] <= other.parameters[key].value <= item.range[1]
+                    yield {"record": name, "law": law, "state": item.state, "inside": inside}
+
+
 def main() -> None:
-    """Fit all records and write table and page."""
+    """Fit all records and write tables and page."""
     args = studies.arguments(__doc__, HERE, page=True).parse_args()
     if not args.page:
         studies.measurements("cartilage-impact", "lattice-impact", "aluminium-foam", "shoe-foam")
         with studies.workplace() as made:
             studies.write_csv(studies.said(compared(made)), args.out / "loops.csv")
-    table = pd.read_csv(args.out / "loops.csv")
+            studies.write_csv(halves(made), args.out / "halves.csv")
+    table, held = (pd.read_csv(args.out / name) for name in ("loops.csv", "halves.csv"))
     judged, worst = table[table["excluded"] != "not judged"], table["fit over plain"].idxmax()
     studies.write_page(
-        HERE, args.out, loops=studies.shown(table), number=len(table), count=len(judged),
-        wrong=int((judged["excluded"] != "nothing").sum()),
+        HERE, args.out, loops=studies.shown(table),
+        halves=studies.shown(held.groupby(["law", "state"], as_index=False).agg(
+            **{"inside": ("inside", "sum"), "of": ("inside", "size")})),
+        number=len(table), count=len(judged), wrong=int((judged["excluded"] != "nothing").sum()),
         worst="{fit over plain:.3f} ({record}, {law})".format(**table.loc[worst]),
     )  # fmt: skip
 

@@ -316,7 +316,7 @@ def _hop(problem: Problem, tracker: Tracker, best: BestPoint, seed: int) -> None
         coarse = Tracker(thinned.objective, tracker.deadline, met=tracker.met, pulse=tracker.pulse)
         coarse.consider(best.values)
         coarse.ends = [best.values, *tracker.ends]
-        search.leave_minimum(coarse, problem.space(), np.random.default_rng(seed), search.SHORT)
+        search.leave_minimum(coarse, problem.space(), np.random.default_rng(seed), search.LONG)
 
 
 def _search(

@@ -23,6 +23,7 @@ from foamfit.report.folder import load_result
 from foamfit.report.readable import readable
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import RULE, Block, Uncertainty, covariance
+from foamfit.trust.intervals import Choice
 from foamfit.trust.profile import Refit
 from foamfit.trust.ranges import ALIKE, ends_alike, left_open, refits_alike, tolerance
 from foamfit.trust.residuals.law_error import curve_errors
@@ -223,6 +224,33 @@ def test_every_description_in_the_range_follows_the_curves_about_as_well():
             assert item.range == pytest.approx(opened.ranges[name], rel=0.05, abs=1e-3)
             assert item.range[0] <= item.value <= item.range[1]
             assert item.ci95 is None or np.ptp(item.range) > 0.0
+
+
+def test_ranges_contain_the_ends_of_hops_that_follow_the_curves_about_as_well():
+    """Of two springs that follow half of a record, those of the other half lay outside."""
+    _, best, found = fitted(0)
+    far, objective = next(refits_alike(best, found.tracker, np.inf)), best.problem.objective
+    worse = best.values.copy()
+    worse[best.places] *= 0.5
+    alone, more = (
+        left_open(best, (), Tracker(objective, met=met), budget=0.0).ranges
+        for met in ([], [far, worse])
+    )
+    assert not alone[best.names[0]][0] <= far[best.places[0]]
+    assert more[best.names[0]][0] == pytest.approx(far[best.places[0]])
+    for name, value in zip(best.names, worse[best.places], strict=True):
+        assert more[name][0] > value or value <= 0.0
+
+
+@pytest.mark.parametrize("led", [False, True])
+def test_hops_of_springs_in_series_are_kept_for_their_ranges(led):
+    _, best, one = fitted(0)
+    assert not one.tracker.met
+    given = best.problem.measurement, "bistable+bistable", None, Options(starts=2)
+    found = identify(*given, lambda *_: None, below=one if led else None)
+    if led:  # the search has combined springs of the poorer model, and hops only here
+        judge(found, Choice(), lambda _: None)
+    assert len(found.tracker.met) > 5
 
 
 def test_the_result_says_what_was_decided(tmp_path):

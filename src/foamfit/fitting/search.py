@@ -281,15 +281,18 @@ def leave_minimum(
     chains = alike(space.model, tracker.best_values)
     ends += halve(functions, space.box, [space.encode(values) for values in chains])
     every = hop(space, ends, functions, rng, patience=patience)
-    if space.model.has_several:  # of one spring, refits near the best point show what is open
-        tracker.met += _near(space, every)
+    tracker.met += _near(space, every)
     tracker.ends = [space.decode(group[0][1]) for group in grouped(every, ALIKE)[:MINIMA]]
     return [(cost, 1) for cost, _ in every[len(ends) :]]
 
 
 def _near(space: Space, ends: list[tuple[float, Array]]) -> list[Array]:
-    """Return the parameters of the ends that may fit almost as well as the best one."""
-    most = NEAR * min((cost for cost, _ in ends), default=math.inf)
+    """Return the parameters of the ends that may fit almost as well as the best one.
+
+    None of a single spring, of which refits near the best point show what is open.
+    """
+    several = space.model.has_several
+    most = NEAR * min((cost for cost, _ in ends), default=math.inf) if several else -math.inf
     return [space.decode(point) for cost, point in ends if cost <= most]
 
 
