@@ -11,7 +11,7 @@ import foamfit as ff
 from conftest import ROOT
 from foamfit.cli.fit import batch, fit
 from foamfit.one_model import Options
-from foamfit.options import OF_FIT, OPTIONS, Given, Keywords, table
+from foamfit.options import OF_FIT, OPTIONS, Given, Keywords
 from foamfit.study.study_file import _KEYS
 
 
@@ -41,6 +41,25 @@ def test_help_in_python_has_every_option_with_unit_and_default():
                 assert one.default is None or f"Default: {one.default!r}" in text
                 assert one.unit in text
         assert "**options" not in text
+
+
+def table():
+    """The table of all options in docs/options.md."""
+    lines = [
+        "| command | Python | unit | default | admissible | meaning |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for one in OPTIONS.values():
+        command = "" if one.python_only else f"`{f'{one.flag} {one.metavar}'.strip()}`"
+        python = "" if one.command_only else f"`{one.name}`"
+        default = (
+            "off"
+            if one.kind == "bool"
+            else one.usual or str("" if one.default in (None, ()) else one.default)
+        )
+        cells = (command, python, one.unit, default, one.right, one.told)
+        lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
+    return "\n".join(lines)
 
 
 def test_the_documentation_has_the_table():

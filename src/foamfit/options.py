@@ -1,7 +1,7 @@
 """The options of a fit: the table of their names, types, units, defaults and admissible values.
 
-The command line, `foamfit.fit`, batches, study files, the page and docs/options.md are made from
-it. It imports nothing of the package but errors, so every room may use it.
+The command line, `foamfit.fit`, batches, study files and the page are made from it. It imports
+nothing of the package but errors, so every room may use it.
 """
 
 from __future__ import annotations
@@ -279,22 +279,3 @@ def documented(function: F) -> F:
         r"^\*\*options\n(    .*\n)+", lambda _: "\n".join(entries) + "\n", text, flags=re.MULTILINE
     )
     return function
-
-
-def table() -> str:
-    """Return all options as a Markdown table, the content of docs/options.md."""
-    lines = [
-        "| command | Python | unit | default | admissible | meaning |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
-    for one in OPTIONS.values():
-        command = "" if one.python_only else f"`{f'{one.flag} {one.metavar}'.strip()}`"
-        python = "" if one.command_only else f"`{one.name}`"
-        default = (
-            "off"
-            if one.kind == "bool"
-            else one.usual or str("" if one.default in (None, ()) else one.default)
-        )
-        cells = (command, python, one.unit, default, one.right, one.told)
-        lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
-    return "\n".join(lines)
