@@ -222,19 +222,6 @@ def stamp() -> dict[str, Any]:
     return {"schema": SCHEMA, "foamfit": version("foamfit")}
 
 
-def loop_of(test: Measurement, along: Array | None, over_time: Array | None) -> Loop | None:
-    """Return the loop of a test against strain, or else against time; None without either.
-
-    The fitted stress (Pa) is `along` in the first case and `over_time` in the second.
-    """
-    if test.displacement is not None and along is not None:
-        strain = test.displacement / test.specimen.height
-        return Loop(test.name, strain, "strain", test.stress, along)
-    if test.time is None:
-        return None
-    return Loop(test.name, test.time, "time (s)", test.stress, over_time)
-
-
 def flags_of(test: Measurement) -> dict[str, Array]:
     """Return columns of flags: which samples are left out as outliers, and which are measured."""
     left = {f"outliers of {name} left out": one.left_out for name, one in test.outliers.items()}
@@ -335,12 +322,12 @@ class Fit(OfLaw):
     @property
     def profiles(self) -> list[Profile]:
         """The profiles, with times and zeros counted from those of the file, as `parameters`."""
-        found, origins = self.intervals.profiles if self.intervals else (), self.measurement.origins
-        moved = ((one, origins.get(one.name, 0.0)) for one in found)
-        return [
-            replace(one, values=one.values + by, ci95=(one.ci95[0] + by, one.ci95[1] + by))
-            for one, by in moved
-        ]
+        moved = list[Profile]()
+        for one in self.intervals.profiles if self.intervals else ():
+            by = self.measurement.origins.get(one.name, 0.0)
+            low, high = one.ci95
+            moved.append(replace(one, values=one.values + by, ci95=(low + by, high + by)))
+        return moved
 
     @property
     def at_noise(self) -> bool | None:
@@ -372,8 +359,14 @@ class Fit(OfLaw):
 
     @property
     def loop(self) -> Loop | None:
-        """The measured and fitted loop, against time where no strain was measured."""
-        return loop_of(self.measurement, self.curves.stress_along, self.curves.stress)
+        """The loop against strain, or else against time; None if neither was measured."""
+        test, fitted = self.measurement, self.curves
+        if test.displacement is not None and fitted.stress_along is not None:
+            strain = test.displacement / test.specimen.height
+            return Loop(test.name, strain, "strain", test.stress, fitted.stress_along)
+        if test.time is None:
+            return None
+        return Loop(test.name, test.time, "time (s)", test.stress, fitted.stress)
 
     @property
     def snapping(self) -> dict[str, Snapping]:
@@ -404,19 +397,18 @@ class Fit(OfLaw):
         """Return the content of ``fit.json``: SI, plain types, null for absent values."""
         from foamfit.springs.model import Model  # drawing needs no compiler
 
-        test = self.measurement
-        head = ("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped")
-        found = ("visited", "misfit", "weights", "statistics", "noise", "energy")
-        model = Model.parse(self.model)
-        more = ("correlation", "ladder", "by_cycle", "priors", "options", "contradictions")
+        def own(*names: str) -> dict[str, Any]:
+            return {name: getattr(self, name) for name in names}
+
+        test, model = self.measurement, Model.parse(self.model)
         optional = {"budget": self.budget and self.budget.contributions}
-        optional |= {name: getattr(self, name) for name in more}
+        optional |= own("correlation", "ladder", "by_cycle", "priors", "options", "contradictions")
         content = {
             **stamp(),
             "test": test.name,
             "data_sha256": test.data_sha256,
-            "data": asdict(test.rows)
-            | {
+            "data": {
+                **asdict(test.rows),
                 "cycle": test.cycle,
                 "last_cycle": test.last_cycle,
                 "cycles": len(test.cycles),
@@ -426,12 +418,13 @@ class Fit(OfLaw):
                 "notes": test.notes,
             },
             "specimen": test.specimen,
-            **{name: getattr(self, name) for name in (*head, "warnings", "notes")},
+            **own("model", "relaxation", "drive", "interior_mass", "seed", "status", "stopped"),
+            **own("warnings", "notes"),
             **model.options,
             "model": model.words,
-            **{name: getattr(self, name) for name in ("checklist", "parameters")},
+            **own("checklist", "parameters"),
             "derived": self._derived(),
-            **{name: getattr(self, name) for name in found},
+            **own("visited", "misfit", "weights", "statistics", "noise", "energy"),
             "outliers": {
                 channel: {name: getattr(found, name) for name in ("at", "values", "clipped_at")}
                 for channel, found in test.outliers.items()

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from foamfit.cli import options
-from foamfit.cli.group import NOT_ACCEPTABLE, main
-from foamfit.cli.options import Output
+from foamfit.cli.options import NOT_ACCEPTABLE, Output, main
 from foamfit.cli.progress import Progress, progress_line
 from foamfit.errors import InputError
 from foamfit.options import FREED, OPTIONS

@@ -10,8 +10,7 @@ import click
 
 from foamfit.cli import options
 from foamfit.cli.fit import folder_name
-from foamfit.cli.group import main
-from foamfit.cli.options import Output
+from foamfit.cli.options import Output, main
 from foamfit.cli.progress import progress_line
 from foamfit.errors import InputError
 from foamfit.terminal import say
