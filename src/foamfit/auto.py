@@ -110,9 +110,6 @@ def _below(model: Model, tried: Sequence[Tried]) -> int | None:
     return min(inside, key=lambda i: tried[i].chisqr, default=None)
 
 
-# ---------------------------------------------------------------- the comparison
-
-
 def compare_models(
     measurement: Measurement, options: Options, progress: Progress, announce: Announce
 ) -> Fit:
@@ -168,10 +165,15 @@ class _Comparison:
         """
         test, groups = self.measurement, []
         heights, inside = test.specimen.heights, max(test.interior, default=0)
-        impact = self.options.drive == "impact"
+
+        def in_turn(model: Model) -> tuple[bool, bool]:
+            # Along a given motion relaxation is tried first, as it is quick there, and two springs
+            # with memory before two without, which need many more starts and are stopped early.
+            return not model.relaxation, model.has_several and model.kinds[0] not in _SLOW
+
         for group in LADDER if test.last_cycle is None else HISTORY:
             allowed = []
-            for model in group if impact else sorted(group, key=_in_turn):
+            for model in group if self.options.drive == "impact" else sorted(group, key=in_turn):
                 why, count = "", len(model.kinds)
                 if inside >= count:
                     why = f"it has no mass {inside} inside, whose motion was measured"
@@ -203,10 +205,9 @@ class _Comparison:
                 self.number += 1
                 if not self._skip(model, _hopeless(model, self.tried, self.unpromising)):
                     self._family(model)
-                if any(one.structureless for one in self.tried):
+                if random := any(one.structureless for one in self.tried):
                     self.ended = "the residuals are random"
-                    return
-                if self.stopped:
+                if random or self.stopped:
                     return
             if len(self.tried) > below > 0:
                 idle = 0 if evidence.choose(self.tried).best >= below else idle + 1
@@ -277,15 +278,6 @@ class _Comparison:
             )
 
 
-def _in_turn(model: Model) -> tuple[bool, bool]:
-    """Return the rank of a model in its group along a given motion.
-
-    Relaxation is tried first, as it is quick there, and two springs with memory before two without,
-    which need many more starts and are stopped where they cannot come near.
-    """
-    return not model.relaxation, model.has_several and model.kinds[0] not in _SLOW
-
-
 def _is_damped(tried: Sequence[Tried]) -> bool:
     """Return whether a model with damping misses far less than every model without."""
     damped, undamped = (
@@ -321,9 +313,6 @@ def _hopeless(model: Model, tried: Sequence[Tried], unpromising: Sequence[Model]
         return f"{told} only"
     (one, told), (other, against) = least(slow, 0), least(_QUICK, 0)
     return f"{told}, {against}" if one > HOPELESS * other else ""
-
-
-# ---------------------------------------------------------------- the result
 
 
 def _conclude(state: _Comparison) -> Fit:

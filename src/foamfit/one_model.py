@@ -224,9 +224,8 @@ def identify(
     starts = each * len(problem.model.kinds) if options.starts is None else options.starts
     deadline = None if options.max_time is None else time.monotonic() + options.max_time
     better = None if options.watch is None else partial(options.watch, problem)
-    tracker = Tracker(problem.objective, deadline, better)
-    tracker.looked = None if look is None else partial(look, problem)
-    led = below is not None
+    looked = None if look is None else partial(look, problem)
+    tracker, led = Tracker(problem.objective, deadline, better, looked=looked), below is not None
     record = SearchRecord(options.seed, starts, began, compiled=SPENT.seconds, led=led)
     known = [] if below is None else carried(problem.space(), below.problem.space(), below.minima())
     given = {*(options.fix or {}), *(params or {})}

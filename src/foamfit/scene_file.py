@@ -22,11 +22,9 @@ from foamfit.springs.laws.record import COMMON, Param
 from foamfit.springs.published import published
 from foamfit.springs.spring import Spring
 
+RESPONSE = "time (s),base stress (Pa),strain"  # first columns of the CSV of a response
 _MOST_SAMPLES = 1_000_000
-# First columns of the CSV of a response.
-RESPONSE = "time (s),base stress (Pa),strain"
-
-
+_Keys = dict[str, toml.Check]
 # Check of a quantity whose sign the chain or the drive checks.
 _any = partial(toml.Quantity, positive=False)
 
@@ -46,31 +44,27 @@ _EXAMPLE = '{ g = 0.5, tau = "0.2 s" }'
 _RELAXATION = toml.Several(
     toml.Table(_TERM, _EXAMPLE, tuple(_TERM)), f"of terms like [{_EXAMPLE}]", "term"
 )
-_CHAIN: dict[str, toml.Check] = {
+_CHAIN: _Keys = {
     "area": _any("m**2", "19.6 mm^2"),
     "diameter": _any("m", "5 mm"),
     "springs": toml.anything,
     "site_damping": _any("Pa*s", "0 Pa*s"),
 }
-_SPRING: dict[str, toml.Check] = {
-    "kind": toml.anything,
-    "height": _of(COMMON["height"]),
-    "mass": _MASS,
-}
-_IMPACT: dict[str, toml.Check] = {
+_SPRING: _Keys = {"kind": toml.anything, "height": _of(COMMON["height"]), "mass": _MASS}
+_IMPACT: _Keys = {
     "kind": toml.anything,
     "mass": _MASS,
     "velocity": _any("m/s", "1.75 m/s"),
     "gravity": _any("m/s**2", "9.81 m/s^2"),
 }
-_TIME: dict[str, toml.Check] = {
+_TIME: _Keys = {
     "end": toml.Quantity("s", "1 ms"),
     "samples": toml.Rule(
         lambda v: type(v) is int and 2 <= v <= _MOST_SAMPLES,
         f"a whole number from 2 to {_MOST_SAMPLES}",
     ),
 }
-_FILE: dict[str, toml.Check] = {
+_FILE: _Keys = {
     "kind": toml.anything,
     "file": toml.Rule(lambda v: isinstance(v, str), 'a CSV like "drive.csv"'),
 }
@@ -123,9 +117,8 @@ def _spring(table: dict[str, Any], number: int) -> tuple[Spring, float, float]:
     """Return a spring, its height, m, and the mass above it, kg."""
     where = f"[chain] spring {number}"
     law = laws.law(_one_of(laws.kinds())(table.get("kind"), f"{where}: kind"))
-    wide = laws.law(
-        laws.with_options(law.kind, laws.options_of(law.kind))
-    )  # all parameters that options can free
+    every = laws.options_of(law.kind)
+    wide = laws.law(laws.with_options(law.kind, every))  # with all parameters that options can free
     law = wide if set(wide.own) - set(law.own) & set(table) else law
     keys = _SPRING | {name: _of(param) for name, param in law.by_name.items()}
     keys |= {"relaxation": _RELAXATION} if law.hysteretic else {}

@@ -88,10 +88,6 @@ def _terminate(number: int, frame: FrameType | None) -> None:
     raise TerminatedError(number)
 
 
-def _handles_signals() -> bool:
-    return threading.current_thread() is threading.main_thread()
-
-
 @contextmanager
 def ending_cleanly() -> Iterator[None]:
     """Turn SIGTERM and a closed terminal into an exception, so that no partial file stays behind.
@@ -99,7 +95,7 @@ def ending_cleanly() -> Iterator[None]:
     Neither these nor Ctrl-C are lost in code that cannot raise, such as numba's callbacks when it
     loads compiled code.
     """
-    if not _handles_signals():
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
     taken = [number for number in ENDING if signal.getsignal(number) is signal.SIG_DFL]
@@ -128,7 +124,7 @@ def _raise_again(lost: Any) -> None:
 @contextmanager
 def without_ctrl_c() -> Iterator[None]:
     """Ignore Ctrl-C in the body, where it would only lose results."""
-    if not _handles_signals():
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

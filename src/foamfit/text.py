@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 import shutil
@@ -197,5 +196,5 @@ def aligned(
 
 def labelled(items: Iterable[tuple[str, str]]) -> str:
     """Write each label, or "", and its text, wrapped from `COLUMN` on; no final newline."""
-    lines = (wrapped(f"{label:<{COLUMN}}{text}", COLUMN + 2) for label, text in items)
-    return "\n".join(itertools.chain.from_iterable(lines))
+    paragraphs = (wrapped(f"{label:<{COLUMN}}{text}", COLUMN + 2) for label, text in items)
+    return "\n".join(line for paragraph in paragraphs for line in paragraph)

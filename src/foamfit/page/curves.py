@@ -17,7 +17,7 @@ from bokeh.plotting import figure
 
 from foamfit.arrays import Array
 from foamfit.page.inputs import WIDE, Sliders, grid, piece
-from foamfit.page.turning import PANELS, Drawn, Row, Turning
+from foamfit.page.turning import PANELS, Drawn, Turning
 from foamfit.report.figures import GREY, VERMILION
 from foamfit.report.panels import AXES, Line, Panel
 from foamfit.report.summary import CURVES, misfit_words
@@ -56,29 +56,28 @@ class Curves:
         self.turning = turning
         self._show_measured(turning)
         self.sliders.rows = [
-            vars(row) | {"held": self.held.get(row.name, row.held)} | self._spans(row)
-            for row in turning.rows.values()
+            row | {"held": self.held.get(name, row["held"])} | self._spans(name, row["factor"])
+            for name, row in turning.rows.items()
         ]
         self.sliders.waiting = False
         self._draw({})
 
-    def _spans(self, row: Row) -> dict[str, list[float]]:
+    def _spans(self, name: str, factor: float) -> dict[str, list[float]]:
         """Return interval and range of the fit, if there are any, in the unit of the slider."""
-        fit = self.found.get(row.name, {})
+        fit = self.found.get(name, {})
         given = {"interval": fit.get("ci95"), "range": fit.get("range")}
-        return {name: [end / row.factor for end in ends] for name, ends in given.items() if ends}
+        return {what: [end / factor for end in ends] for what, ends in given.items() if ends}
 
     def put(self, values: Mapping[str, float]) -> None:
         """Draw the curves at other values (SI), and move the sliders to them."""
         self._draw(values)
         rows = {} if self.turning is None else self.turning.rows
-        self.sliders.show({n: v / rows[n].factor for n, v in values.items() if n in rows})
+        self.sliders.show({n: v / rows[n]["factor"] for n, v in values.items() if n in rows})
 
     def hide(self) -> None:
         """Hide everything."""
-        self.sliders.tell("")
         self.turning = None
-        self.sliders.param.update(rows=[], waiting=False)
+        self.sliders.param.update(told="", wrong=False, rows=[], waiting=False)
         self._panels.visible = False
 
     def chosen(self) -> tuple[dict[str, float], list[str]]:
@@ -91,9 +90,9 @@ class Curves:
             return held, varied
         now, usual = self.turning.named, self.turning.problem.params
         for name, row in self.turning.rows.items():
-            if not self.held.get(name, row.held):
-                varied += [name] if row.held else []
-            elif not row.held or now[name] != usual[name].value:
+            if not self.held.get(name, row["held"]):
+                varied += [name] if row["held"] else []
+            elif not row["held"] or now[name] != usual[name].value:
                 held[name] = now[name]
         return held, varied
 
@@ -157,7 +156,7 @@ class Curves:
         moves, held = event.data.get("moves", {}), event.data.get("held", {})
         rows = {} if self.turning is None else self.turning.rows
         self.held |= {name: value for name, value in held.items() if name in rows}
-        if wanted := {n: value * rows[n].factor for n, value in moves.items() if n in rows}:
+        if wanted := {n: value * rows[n]["factor"] for n, value in moves.items() if n in rows}:
             self._draw(wanted)
         if moves:
             self.sliders.drawn()
@@ -185,7 +184,7 @@ class Curves:
         elif len(test.cycles) > 1:
             text += f", cycle {test.cycle}"
         text += f": misfit {misfits_text(drawn.misfit)}"
-        self.sliders.tell(drawn.error or text, wrong=bool(drawn.error))
+        self.sliders.param.update(told=drawn.error or text, wrong=bool(drawn.error))
 
     def _draw_points(self, drawn: Drawn) -> None:
         fx, fy = self._scales.get("stress_strain", (1.0, 1.0))

@@ -84,8 +84,8 @@ class Sliders(JSComponent):
     rows = param.List()
     ticks = param.Boolean(doc="Whether each has a tick box that fixes it in a fit.")
     waiting = param.Boolean(doc="Whether they are about to be replaced and cannot be moved.")
-    told = param.String()
-    wrong = param.Boolean()
+    told = param.String(doc="A sentence above the sliders.")
+    wrong = param.Boolean(doc="Whether that sentence is an error.")
 
     _esm = TEMPLATES / "sliders.js"
     _stylesheets: ClassVar[list[str]] = [style("inputs"), style("sliders")]
@@ -93,10 +93,6 @@ class Sliders(JSComponent):
     def show(self, values: Mapping[str, float]) -> None:
         """Move the sliders (values in the units of their rows) without drawing."""
         self._send_msg({"values": dict(values)})
-
-    def tell(self, sentence: str, wrong: bool = False) -> None:
-        """Write a sentence above the sliders."""
-        self.param.update(told=sentence, wrong=wrong)
 
     def drawn(self) -> None:
         """Report that the last move has been drawn, so that the next can be sent."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -26,24 +26,6 @@ from foamfit.text import readable_unit
 
 WIDE = 4.0  # upper end of a slider, as a multiple of the value
 PANELS = tuple(CURVES)
-
-
-@dataclass(frozen=True)
-class Row:
-    """A parameter with a slider: value and limits in a readable unit.
-
-    `low` and `high` are the ends of the slider, `least` and `most` the admissible limits.
-    """
-
-    name: str
-    unit: str
-    factor: float  # SI value of the unit
-    value: float
-    low: float
-    high: float
-    least: float
-    most: float
-    held: bool = False  # whether it is fixed in a fit by default
 
 
 @dataclass(frozen=True)
@@ -70,11 +52,7 @@ class Turning:
         self.problem: Problem = Options(**options).problem(measurement, model)
         self.values = self._guess() if not values else self._at(self.problem.vector(), values)
         self.rows = {name: self._row(name) for name in self.problem.names if self._own(name)}
-
-    @property
-    def drive(self) -> str:
-        """The drive of the chain."""
-        return self.problem.objective.drive
+        self.drive = self.problem.objective.drive
 
     @property
     def law(self) -> str:
@@ -151,7 +129,11 @@ class Turning:
         rank(tracker, space, starts)
         return np.asarray(problem.vector() if tracker.best_values is None else tracker.best_values)
 
-    def _row(self, name: str) -> Row:
+    def _row(self, name: str) -> dict[str, Any]:
+        """Return what a slider shows, in a unit of `factor` in SI, and whether a fit holds it.
+
+        The slider reaches from `low` to `high`; `least` and `most` are the admissible limits.
+        """
         parameter = self.problem.params[name]
         value = float(self.values[self.problem.index[name]])
         factor, shown = readable_unit(value, unit_of(name))
@@ -159,6 +141,7 @@ class Turning:
         low, high = sorted((0.0, far))
         if split_name(name)[1] == "time_shift":
             low, high = parameter.min, parameter.max
-        ends = max(low, parameter.min), min(high, parameter.max), parameter.min, parameter.max
-        value, low, high, least, most = (one / factor for one in (value, *ends))
-        return Row(name, shown, factor, value, low, high, least, most, held=not parameter.vary)
+        row = {"value": value, "low": max(low, parameter.min), "high": min(high, parameter.max)}
+        row |= {"least": parameter.min, "most": parameter.max}
+        about = {"name": name, "unit": shown, "factor": factor, "held": not parameter.vary}
+        return about | {key: one / factor for key, one in row.items()}
