@@ -80,8 +80,6 @@ class Window:
         if test is not None:
             pn.state.onload(partial(self._take, test))
 
-    # ------------------------------------------------------------------------------- the parts
-
     def _template(self) -> Any:
         """Return the page with its parts in their places."""
         made = pn.Template((ui.TEMPLATES / "page.html").read_text(encoding="utf-8"))
@@ -102,14 +100,8 @@ class Window:
         """Return the buttons that save parts of a result."""
 
         def save(what: str, name: str, content: Callable[[], bytes]) -> Any:
-            return pn.widgets.FileDownload(
-                label=f"Save {what}",
-                filename=name,
-                callback=lambda: BytesIO(content()),
-                embed=False,
-                auto=True,
-                **ui.STYLE,
-            )
+            how: Any = {"filename": name, "callback": lambda: BytesIO(content()), **ui.STYLE}
+            return pn.widgets.FileDownload(label=f"Save {what}", embed=False, auto=True, **how)
 
         saves = [
             save("the result folder", "result.zip", self.desk.zipped),
@@ -121,8 +113,6 @@ class Window:
 
     def _report(self) -> str:
         return (self.desk.fits[self.report_of.value] / "report.html").read_text(encoding="utf-8")
-
-    # ------------------------------------------------------------------------------- beside
 
     def _allow(self) -> None:
         """Enable the Fit button: there is a test, the solver is compiled, and no fit is running."""
@@ -153,8 +143,6 @@ class Window:
             document.add_next_tick_callback(lambda: then(found) if last() else None)
 
         pool.submit(run)
-
-    # ------------------------------------------------------------------------------- the test
 
     def _refuse(self, error: object) -> None:
         self.problem.object = ui.wrong(error)
@@ -237,8 +225,6 @@ class Window:
         if found.picture is not None:
             self.misfit.object = ui.piece("preview", base64.b64encode(found.picture).decode())
 
-    # ------------------------------------------------------------------------------- the curves
-
     def _model_chosen(self) -> None:
         """Show the curves of the model, with start values read off the measured loop."""
         auto = self.inputs.auto
@@ -283,8 +269,6 @@ class Window:
             self.curves.hide()
             self.misfit.object = ui.wrong(made)
 
-    # ------------------------------------------------------------------------------- the fit
-
     def _run(self, event: Any = None) -> None:
         arguments = self.inputs.arguments()
         if not self.inputs.auto:
@@ -327,24 +311,22 @@ class Window:
             return
         news, share = worker.news, round(100 * worker.news.fraction)
         what = "stopping; the best point is kept" if self.stop.disabled else news.what
-        told = f"{what}, {share} %"
-        if news.misfit:
-            told += f"; best misfit {misfits_text(news.misfit)}"
-        self.progress.object = ui.piece("progress", share, told)
+        best = f"; best misfit {misfits_text(news.misfit)}" if news.misfit else ""
+        self.progress.object = ui.piece("progress", share, f"{what}, {share} %{best}")
         self._show_best(news)
 
     def _show_best(self, news: News) -> None:
         """Draw the curves of the best point so far, and move the sliders to it."""
         if not news.values or self.desk.measurement is None:
             return
-        now = self.curves.turning
-        test = None if now is None else now.problem.measurement
-        shown = now and test and (now.law, now.drive, test.cycle, test.last_cycle)
-        law = law_in_words(news.model, news.relaxation)
-        if shown != (law, news.drive, news.cycle, news.last_cycle):
-            self._turn_fitted(news)
-        else:
+        law, shown = law_in_words(news.model, news.relaxation), None
+        if (now := self.curves.turning) is not None:
+            test = now.problem.measurement
+            shown = now.law, now.drive, test.cycle, test.last_cycle
+        if shown == (law, news.drive, news.cycle, news.last_cycle):
             self.curves.put(news.values)
+        else:
+            self._turn_fitted(news)
 
     def _turn_fitted(self, news: News) -> None:
         """Show the curves of the last fit at the reported values."""

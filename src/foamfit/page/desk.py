@@ -74,8 +74,6 @@ class Desk:
             self.worker.end()
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    # ------------------------------------------------------------------------------- files
-
     def receive(self, name: str, content: bytes) -> Fields | None:
         """Store a dropped table as test.*, or return the content of a TOML.
 
@@ -119,8 +117,6 @@ class Desk:
         toml = toml_beside(csv)
         return self.receive("test.toml", toml.read_bytes()) if toml.is_file() else cleared
 
-    # ------------------------------------------------------------------------------- the test
-
     def check(self, quantities: Mapping[str, str], rest: str, arguments: Sequence[str] = ()) -> str:
         """Read the test as `foamfit check` does, and return the text that it prints.
 
@@ -161,8 +157,6 @@ class Desk:
         """Return a message with the user's name of the file, without the folder of the window."""
         text = text.replace(f"{self.folder}/", "").replace(f"{self.folder}\\", "")
         return text if self.csv is None else text.replace(self.csv.name, self.given)
-
-    # ------------------------------------------------------------------------------- the fit
 
     def fit(self, arguments: list[str], tell: Callable[[], object] = lambda: None) -> Worker:
         """Start a fit of the test checked last, with arguments of `foamfit fit`.

@@ -36,8 +36,7 @@ def piece(name: str, *given: Any) -> str:
     return str(getattr(environment().get_template("pieces.html").module, name)(*given))
 
 
-FIELD = style("field")
-STYLE: dict[str, Any] = {"stylesheets": [FIELD], "sizing_mode": "stretch_width", "margin": (3, 0)}
+STYLE: dict[str, Any] = {**WIDE, "stylesheets": [style("field")], "margin": (3, 0)}
 
 
 def text() -> Any:
@@ -109,18 +108,16 @@ class Field:
         words = name.replace("_", " ").capitalize()
         self.label = f"{words}{f' ({like})' if like else ''}: {option.text}"
         made: dict[str, Any] = {"name": self.label, **style}
-        listed = [*option.choices] or listed
-        if listed is not None:
-            some = {str(one): one for one in listed}
-            made["options"] = {"default": ""} | some if self.default is None else some
-            made["value"] = "" if self.default is None else self.default
-            self.widget = pn.widgets.Select(**made)
+        value = "" if self.default is None else self.default
+        if (listed := [*option.choices] or listed) is not None:
+            unset = {"default": ""} if self.default is None else {}
+            options = unset | {str(one): one for one in listed}
+            self.widget = pn.widgets.Select(options=options, value=value, **made)
         elif option.kind == "bool":
             # A group with one box: screen readers do not read the label of Panel's single checkbox.
             self.widget = pn.widgets.CheckBoxGroup(options=[self.label], **style)
         else:
-            shown = "" if self.default is None else str(self.default)
-            self.widget = pn.widgets.TextInput(value=shown, **made)
+            self.widget = pn.widgets.TextInput(value=str(value), **made)
 
     def arguments(self) -> list[str]:
         """Return the arguments for the value filled in; none for the default."""

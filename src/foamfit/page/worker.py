@@ -132,9 +132,6 @@ class FirstUse:
             self.process.kill()
 
 
-# ------------------------------------------------------------------------ in the other processes
-
-
 def _leave_terminal() -> None:
     """Keep Ctrl-C in the terminal from this process: the server of the page ends it."""
     if hasattr(os, "setpgrp"):  # not on Windows
