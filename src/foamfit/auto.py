@@ -262,10 +262,7 @@ class _Comparison:
         return Tried(result, damping, best, time.perf_counter() - began, predicted)
 
     def _look(self, damping: str, problem: Problem, values: Array) -> None:
-        """Stop the fit of a chain if its first descents are far worse than no more springs.
-
-        Springs are compared with and without `damping` alike.
-        """
+        """Stop a fit if its first descents are far worse than no more springs, damped alike."""
         like = (one for one in self.tried if damping in (one.damping, "none"))
         count = problem.model.name.count("+")
         fewer = (one for one in like if one.result.model.count("+") <= count)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from foamfit.cli import options
-from foamfit.cli.options import NOT_ACCEPTABLE, Output, main
+from foamfit.cli.options import NOT_ACCEPTABLE, Output, declared, main, option
 from foamfit.cli.progress import Progress, progress_line
 from foamfit.errors import InputError
 from foamfit.options import FREED, OPTIONS
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from foamfit.study.batch import Batch
     from foamfit.study.cycles import CycleFits
 
-# Options that are not keywords of `foamfit.fit`, and options that select its `intervals`.
-NO_KEYWORDS, WAYS = ("cycle", "cycles", "model"), ("profile", "mcmc")
+# Options of the command that are not keywords of `foamfit.fit`
+NO_KEYWORDS = ("cycle", "cycles", "model", "profile", "mcmc")
 PATIENCE = 10  # s, time limit for a scheduler to answer
 
 fit_options = options.together(
-    *(options.declared(name) for name, one in OPTIONS.items() if not one.python_only)
+    *(declared(name) for name, one in OPTIONS.items() if not one.python_only)
 )
 
 
@@ -46,13 +46,13 @@ def keywords_of(asked: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of a command as keywords of `foamfit.fit`."""
     if asked["cycle"] is not None and asked["cycles"] is not None:
         raise InputError("give either --cycle or --cycles, not both")
-    given = {way: asked[way] for way in WAYS if asked[way] not in (None, False)}
-    if len(given) > 1:
-        names = " and ".join(f"--{way}" for way in given)
-        raise InputError(f"{names} exclude each other; choose one method for the intervals")
-    search = {name: one for name, one in asked.items() if name not in (*NO_KEYWORDS, *WAYS)}
-    way, draws = next(iter(given.items()), ("auto", None))
-    return search | {"intervals": way, "draws": None if draws is True else draws}
+    profile, draws = asked["profile"], asked["mcmc"]
+    if profile and draws is not None:
+        why = "--profile and --mcmc exclude each other; choose one method for the intervals"
+        raise InputError(why)
+    way = "profile" if profile else "auto" if draws is None else "mcmc"
+    search = {name: one for name, one in asked.items() if name not in NO_KEYWORDS}
+    return search | {"intervals": way, "draws": draws}
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,8 @@ def folder_name(options: Mapping[str, Any]) -> str:
 @options.TEST
 @fit_options
 @options.output("fits/<test>/<model and options>", "fit.json")
-@options.option("--force", "Replace a result of other data or options in the same folder.")
-@options.option("--verbose", "Also print the checklist, reasons, notes and all models.")
+@option("--force", "Replace a result of other data or options in the same folder.")
+@option("--verbose", "Also print the checklist, reasons, notes and all models.")
 def fit(
     test: Path, specimen: Path | None, output: Output, force: bool, verbose: bool, **asked: Any
 ) -> int:
@@ -175,16 +175,14 @@ def fit(
 @main.command()
 @click.argument("tests", metavar="TEST.csv|FOLDER|GLOB …", nargs=-1, required=True)
 @fit_options
-@options.option(
+@option(
     "--jobs",
     "Processes on this machine, one thread each. Default: one for each core.",
     options.COUNT,
     metavar="N",
 )
-@options.option(
-    "--scheduler", "A running Dask scheduler, as tcp://127.0.0.1:8786.", metavar="ADDRESS"
-)
-@options.option("--fresh", "Fit everything again, including what is already done.")
+@option("--scheduler", "A running Dask scheduler, as tcp://127.0.0.1:8786.", metavar="ADDRESS")
+@option("--fresh", "Fit everything again, including what is already done.")
 @options.output("fits/batch/<model>", "the rows as JSON", always_page=True)
 def batch(
     tests: tuple[str, ...],
@@ -274,9 +272,7 @@ def _cluster(address: str) -> Iterator[Executor]:
 
 @main.command()
 @click.argument("study", metavar="STUDY.toml", type=options.FILE)
-@options.declared(
-    "seed", default=None, help="The same tests and seed give the same numbers. Default: 0."
-)
+@declared("seed", default=None, help="The same tests and seed give the same numbers. Default: 0.")
 @options.output("fits/<STUDY>; fits/<plan>-joint for the joint.toml of a plan", "joint.json")
 def joint(study: Path, seed: int | None, output: Output) -> int:
     """Fit the tests of STUDY.toml together.

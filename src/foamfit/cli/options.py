@@ -238,10 +238,7 @@ class Output:
         return self.quiet or self.as_json
 
     def folder(self, default: Path, of: str | None = None) -> Path:
-        """Return the result folder; InputError if it cannot be written.
-
-        With `of`, the name of a result file, only results of this kind may be replaced.
-        """
+        """Return the result folder; InputError if it must not be replaced by the result `of`."""
         from foamfit.report.folder import check_target
 
         folder = default if self.out is None else self.out

@@ -10,7 +10,7 @@ import click
 
 from foamfit.cli import options
 from foamfit.cli.fit import folder_name
-from foamfit.cli.options import Output, main
+from foamfit.cli.options import COUNT, FILE, Output, compile_solver, declared, main, option
 from foamfit.cli.progress import progress_line
 from foamfit.errors import InputError
 from foamfit.terminal import say
@@ -43,8 +43,8 @@ def check(test: Path, specimen: Path | None) -> None:
 
 @main.command()
 @options.TEST
-@options.option("--force", "Overwrite an existing TOML.")
-@options.option("--rig", "Write a draft of a rig for foamfit plan, with the name given.")
+@option("--force", "Overwrite an existing TOML.")
+@option("--rig", "Write a draft of a rig for foamfit plan, with the name given.")
 def init(test: Path, force: bool, rig: bool) -> None:
     """Write a TOML for TEST.csv, with questions to answer.
 
@@ -85,11 +85,11 @@ def _write(target: Path, text: str, force: bool, kept: str) -> None:
 
 
 @main.command()
-@click.argument("scene", metavar="SCENE.toml", type=options.FILE)
-@options.option("--out", "CSV of the response. Default: SCENE.csv in this folder.", options.FILE)
+@click.argument("scene", metavar="SCENE.toml", type=FILE)
+@option("--out", "CSV of the response. Default: SCENE.csv in this folder.", FILE)
 @options.PLOT
 @options.WIDTH
-@options.option(
+@option(
     "--rtol", "Largest error, divided by the range.", click.FloatRange(1e-14, 0.1), default=1e-6
 )
 def simulate(
@@ -131,7 +131,7 @@ def simulate(
     check_file(target)
     check_target(target)  # the scene and its drive are kept, as every file of others
     chain, drive, time = read_scene(scene)
-    options.compile_solver(quiet=False)
+    compile_solver(quiet=False)
     response = run(chain, drive, time, rtol)
     write_response(response, target)
     say(f"{response.solver}, {response.time.size} samples, written to {target}")
@@ -143,9 +143,9 @@ def simulate(
 
 
 @main.command()
-@click.argument("test", metavar="[TEST.csv]", type=options.FILE, required=False)
-@options.option("--port", "Port of 127.0.0.1; 0: a free one.", click.IntRange(0, 65535), default=0)
-@options.option("--no-browser", "Print the address only; open no browser.")
+@click.argument("test", metavar="[TEST.csv]", type=FILE, required=False)
+@option("--port", "Port of 127.0.0.1; 0: a free one.", click.IntRange(0, 65535), default=0)
+@option("--no-browser", "Print the address only; open no browser.")
 def page(test: Path | None, port: int, no_browser: bool) -> None:
     """Check, fit and explore TEST.csv in a browser.
 
@@ -173,15 +173,12 @@ def page(test: Path | None, port: int, no_browser: bool) -> None:
 
 
 def _named(*results: str | Path, **given: Any) -> str:
-    """Return a name from the places of results below fits/, and from the options given.
-
-    It is foam-bistable-cycle-2 for fits/foam/bistable and cycle 2. Of a result elsewhere it has the
-    last two folders.
-    """
+    """Return a name like foam-bistable-cycle-2, for fits/foam/bistable and cycle 2."""
     names = list[str]()
     for one in results:
         place = Path(one).resolve()
         *above, last = (place.parent if place.is_file() else place).parts
+        # The folders below fits/; elsewhere the last two
         below = len(above) - above[::-1].index("fits") if "fits" in above else -1
         names.append("-".join([*above[below:], last]))
     asked = {name: value for name, value in given.items() if value is not None}
@@ -189,8 +186,8 @@ def _named(*results: str | Path, **given: Any) -> str:
 
 
 @main.command()
-@click.argument("results", metavar="RESULT [RESULT …]", nargs=-1, required=True, type=options.FILE)
-@options.option(
+@click.argument("results", metavar="RESULT [RESULT …]", nargs=-1, required=True, type=FILE)
+@option(
     "--published name",
     "Published set to compare with. Default: the one in the name of the test.",
     str,
@@ -221,8 +218,8 @@ def compare(
 
 
 @main.command("list")
-@click.argument("folder", metavar="[FOLDER]", default="fits", type=options.FILE)
-@options.option("--open opening", "Open the page in the browser.")
+@click.argument("folder", metavar="[FOLDER]", default="fits", type=FILE)
+@option("--open opening", "Open the page in the browser.")
 def list_results(folder: Path, opening: bool) -> None:
     """List the results in FOLDER (default: fits), a line each.
 
@@ -252,28 +249,21 @@ def published() -> None:
 
 
 @main.command()
-@click.argument("result", metavar="RESULT", type=options.FILE)
+@click.argument("result", metavar="RESULT", type=FILE)
 @options.TEST
 @options.SPECIMEN
-@options.declared(
-    "cycle",
-    help="Cycle of a slow record. Default: the first.",
-    type=options.COUNT,
-    metavar="N",
-)
+@declared("cycle", help="Cycle of a slow record. Default: the first.", type=COUNT, metavar="N")
 @options.CYCLES
-@options.declared("drive", help="Default: the drive of the result.")
-@options.option(
-    "--extrapolate", "Allow a rate outside the fitted rates by more than a factor of 1.25."
-)
-@options.option(
+@declared("drive", help="Default: the drive of the result.")
+@option("--extrapolate", "Allow a rate outside the fitted rates by more than a factor of 1.25.")
+@option(
     "--draws",
     "Number of random specimens for the band.",
     click.IntRange(40, 100_000),
     default=400,
     metavar="N",
 )
-@options.declared("seed", help="The same result, test and seed give the same numbers.")
+@declared("seed", help="The same result, test and seed give the same numbers.")
 @options.output("predictions/<test>/<result and options>", "prediction.json")
 def predict(
     result: Path,
@@ -309,21 +299,20 @@ def predict(
     measurement = read_test(test, specimen, cycle, cycles=cycles)
     from foamfit.study import predict as study
 
-    options.compile_solver(output.silent)
+    compile_solver(output.silent)
     output.finish(study.predict(result, measurement, **asked), folder / "prediction.png")
 
 
 @main.command()
 @click.argument("results", metavar="RESULT [RESULT …]", nargs=-1, required=True)
-@options.option("--rig", "What the rig can do. Default: the record of RESULT.", options.FILE,
-                metavar="RIG.toml")  # fmt: skip
-@options.option(
+@option("--rig", "What the rig can do. Default: the record of RESULT.", FILE, metavar="RIG.toml")
+@option(
     "--for quantity",
     "What the foam is needed for: peak_force, peak_strain, absorbed_energy or dissipated_energy "
     "at a velocity.",
     metavar='"peak_force at 3 m/s"',
 )
-@options.declared("seed", help="The same results, rig and seed give the same numbers.")
+@declared("seed", help="The same results, rig and seed give the same numbers.")
 @options.output("plans/<results and options>", "plan.json")
 def plan(
     results: tuple[str, ...], rig: Path | None, quantity: str | None, seed: int, output: Output
@@ -346,7 +335,7 @@ def plan(
     folder = output.folder(Path("plans", name), "plan.json")
     from foamfit.study import plan as study
 
-    options.compile_solver(output.silent)
+    compile_solver(output.silent)
     with progress_line(output.silent, "plan") as line:
         found = study.plan(*results, rig=rig, quantity=quantity, seed=seed,
                            progress=line.progress)  # fmt: skip
@@ -354,25 +343,25 @@ def plan(
 
 
 @main.command()
-@click.argument("result", metavar="RESULT", type=options.FILE)
-@options.option(
+@click.argument("result", metavar="RESULT", type=FILE)
+@option(
     "--format",
     "LS-DYNA *MAT_083 or *MAT_057, Radioss LAW90, Abaqus low-density foam, or curves only.",
     metavar="mat083|mat057|law90|abaqus|csv",
     required=True,
 )
-@options.option(
+@option(
     "--units", "Consistent units of the card.", metavar="kg-mm-ms|t-mm-s|SI", default="kg-mm-ms"
 )
-@options.option(
+@option(
     "--rates",
     "Strain rates of the loading curves, 1/s. Default: those of the fitted tests.",
     metavar="RATE,RATE,…",
 )
-@options.option(
+@option(
     "--out",
     "Card file. Default: cards/<result>-<format> with the extension of the format.",
-    options.FILE,
+    FILE,
 )
 def card(result: Path, format: str, units: str, rates: str | None, out: Path | None) -> None:
     """Write a material card for finite elements.
@@ -399,7 +388,7 @@ def card(result: Path, format: str, units: str, rates: str | None, out: Path | N
         raise InputError(
             f"{file} lies in a result folder, which may be replaced; choose another --out"
         )
-    options.compile_solver(False, source.model.name)
+    compile_solver(False, source.model.name)
     made = cards.card(result, format=format, units=units, rates=asked)
     if out is None:
         with suppress(OSError):  # saving says that there is no such folder

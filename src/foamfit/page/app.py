@@ -123,10 +123,7 @@ class Window:
     def _beside(
         self, pool: ThreadPoolExecutor, work: Callable[[], Any], then: Callable[[Any], None]
     ) -> None:
-        """Work in a thread, then show the result unless it is out of date.
-
-        Results are shown in a callback of the document, because threads do not hold its lock.
-        """
+        """Work in a thread, then show the result unless it is out of date."""
         self._asked[pool] += 1
         asked, document = self._asked[pool], pn.state.curdoc
 
@@ -140,6 +137,7 @@ class Window:
                 found = work()
             except Exception as error:  # show it; a thread would lose it
                 found = error
+            # In a callback of the document, because a thread does not hold its lock
             document.add_next_tick_callback(lambda: then(found) if last() else None)
 
         pool.submit(run)

@@ -81,10 +81,7 @@ class Curves:
         self._panels.visible = False
 
     def chosen(self) -> tuple[dict[str, float], list[str]]:
-        """Return the parameters to fix in a fit, with values (SI), and those to vary.
-
-        Parameters that are fixed at this value, or varied, by default are omitted.
-        """
+        """Return what a fit must fix, by name (SI), and vary, other than it does by default."""
         held, varied = dict[str, float](), list[str]()
         if self.turning is None:
             return held, varied

@@ -65,15 +65,13 @@ def button(name: str, do: Callable[[Any], None], kind: str = "default", **more: 
 
 
 def grid(parts: list[Any], width: float, *, visible: bool = False) -> pn.Column:
-    """Arrange parts side by side, each at least `width` rem wide.
-
-    The outer column is hidden, because a grid itself would stay visible.
-    """
+    """Arrange parts side by side, each at least `width` rem wide."""
     style = (
         ":host { display: grid; gap: .4rem; "
         f"grid-template-columns: repeat(auto-fit, minmax(min(100%, {width}rem), 1fr)); }} "
         ".scroll-button { display: none; }"  # it would take the place of a part
     )
+    # The outer column is hidden, because a grid itself would stay visible.
     return pn.Column(pn.Column(*parts, stylesheets=[style], **WIDE), visible=visible, **WIDE)
 
 

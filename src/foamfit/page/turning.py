@@ -71,11 +71,8 @@ class Turning:
         return dict(zip(self.problem.names, values.tolist(), strict=True))
 
     def _own(self, name: str) -> bool:
-        """Return whether a parameter has a slider.
-
-        Parameters of the record (such as the contact time), known heights and parameters with an
-        expression have none; the time shift has one.
-        """
+        """Return whether a parameter has a slider."""
+        # Those of the record (such as the contact time), known heights and expressions have none.
         heights, short = self.problem.measurement.specimen.heights, split_name(name)[1]
         of_record = name in NUISANCE or (short == "height" and heights is not None)
         return name == "time_shift" or not (of_record or self.problem.params[name].expr)
@@ -130,10 +127,7 @@ class Turning:
         return np.asarray(problem.vector() if tracker.best_values is None else tracker.best_values)
 
     def _row(self, name: str) -> dict[str, Any]:
-        """Return what a slider shows, in a unit of `factor` in SI, and whether a fit holds it.
-
-        The slider reaches from `low` to `high`; `least` and `most` are the admissible limits.
-        """
+        """Return a slider: unit (`factor` in SI), value, ends, limits, and if a fit holds it."""
         parameter = self.problem.params[name]
         value = float(self.values[self.problem.index[name]])
         factor, shown = readable_unit(value, unit_of(name))

@@ -111,10 +111,7 @@ class Worker:
 
 
 class FirstUse:
-    """Compiles the solver in another process, once after installation.
-
-    The page stays responsive meanwhile; `done` is the end of compiling.
-    """
+    """Compiles the solver in another process, once after installation; `done` is the end of it."""
 
     def __init__(self) -> None:
         self.process = processes().Process(target=_compile, daemon=True)
