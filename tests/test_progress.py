@@ -11,9 +11,9 @@ import pytest
 
 import foamfit as ff
 from conftest import RECONSTRUCTION, synthetic_impact, without_pictures
-from foamfit import api
-from foamfit.cli import main, progress as module
-from foamfit.cli.progress import ProgressLine, progress_line
+from foamfit import api, terminal as module
+from foamfit.cli import main
+from foamfit.terminal import ProgressLine, progress_line
 
 pty = pytest.importorskip("pty")
 

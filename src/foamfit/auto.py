@@ -95,21 +95,6 @@ def _dampers(params: lmfit.Parameters) -> list[str]:
     return [name for name in params if split_name(name)[1] == "eta" and params[name].vary]
 
 
-def _below(model: Model, tried: Sequence[Tried]) -> int | None:
-    """Return the place of the best model with the same hysteretic springs, and nothing more."""
-
-    def hysteretic(model: Model) -> list[str]:
-        return sorted(law.word or law.kind for law in model.laws if law.hysteretic)
-
-    def contained(other: Model) -> bool:
-        fewer = len(other.kinds) <= len(model.kinds) and other.relaxation <= model.relaxation
-        return fewer and hysteretic(other) == hysteretic(model)
-
-    models = [Model.parse(one.result.model, one.result.relaxation) for one in tried]
-    inside = [i for i, one in enumerate(models) if contained(one)]
-    return min(inside, key=lambda i: tried[i].chisqr, default=None)
-
-
 def compare_models(
     measurement: Measurement, options: Options, progress: Progress, announce: Announce
 ) -> Fit:
@@ -240,11 +225,23 @@ class _Comparison:
         options = self.options
         return make_params(self.measurement, model, options.drive, time_shift=options.time_shift)
 
+    def _below(self, model: Model) -> Found | None:
+        """Return the best fit of a model with the same hysteretic springs, and nothing more."""
+
+        def hysteretic(model: Model) -> list[str]:
+            return sorted(law.word or law.kind for law in model.laws if law.hysteretic)
+
+        def contained(other: Model) -> bool:
+            fewer = len(other.kinds) <= len(model.kinds) and other.relaxation <= model.relaxation
+            return fewer and hysteretic(other) == hysteretic(model)
+
+        inside = [i for i, one in enumerate(self.fits) if contained(one.problem.model)]
+        best = min(inside, key=lambda i: self.tried[i].chisqr, default=None)
+        return None if best is None else self.fits[best]
+
     def _fit(self, model: Model, damping: str, left: float | None, i: int, count: int) -> Tried:
         """Fit one model with or without damping; `i` of its `count` fits come before."""
         began, params = time.perf_counter(), self._params(model)
-        inside = _below(model, self.tried)
-        below = None if inside is None else self.fits[inside]
         if damping == "without":
             for name in _dampers(params):
                 params[name].set(value=0.0, vary=False)
@@ -253,7 +250,9 @@ class _Comparison:
         tell = part_of(self.progress, start, end, f"model {self.number} of {self.of}: {named}: ")
         options = replace(self.options, max_time=left, relaxation=model.relaxation)
         look = partial(self._look, damping) if len(model.kinds) > 1 else None
-        found = one_model.identify(self.measurement, model.name, params, options, tell, look, below)
+        found = one_model.identify(
+            self.measurement, model.name, params, options, tell, look, self._below(model)
+        )
         (result, best), predicted = one_model.judge(found, COMPARED, lambda _: None), None
         if not result.stopped:
             with suppress(SearchStoppedError):

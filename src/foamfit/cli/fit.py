@@ -18,10 +18,9 @@ import click
 
 from foamfit.cli import options
 from foamfit.cli.options import NOT_ACCEPTABLE, Output, declared, main, option
-from foamfit.cli.progress import Progress, progress_line
 from foamfit.errors import InputError
 from foamfit.options import FREED, OPTIONS
-from foamfit.terminal import say
+from foamfit.terminal import Progress, progress_line, say
 from foamfit.text import option_value
 
 if TYPE_CHECKING:
@@ -65,12 +64,6 @@ class Ready:
     model: str
     options: Options
     several: tuple[int, ...] | None  # cycles to be fitted one by one, () for all
-
-    @property
-    def stored(self) -> dict[str, Any]:
-        """The options that the result stores."""
-        several = () if self.several is None else self.several or self.measurement.cycles
-        return self.options.stored(self.measurement, self.model, several)
 
     def fit(self, news: Progress) -> FitResult | CycleFits:
         """Fit the test, or the cycles of the record, and report the progress."""
@@ -155,7 +148,8 @@ def fit(
     from foamfit.report.folder import check_same
 
     ready, toml = read_as_asked(test, specimen, asked), toml_beside(test)
-    made = ready.stored
+    several = () if ready.several is None else ready.several or ready.measurement.cycles
+    made = ready.options.stored(ready.measurement, ready.model, several)
     if specimen not in (None, toml):
         made["specimen"] = specimen.stem
     folder = output.folder(Path("fits", toml.stem, folder_name(made)))

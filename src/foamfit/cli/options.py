@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from foamfit.cli.progress import progress_line
+from foamfit import terminal
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.files import check_file
 from foamfit.options import OPTIONS
-from foamfit.terminal import TerminatedError, ending_cleanly, say, show_all, without_ctrl_c
+from foamfit.terminal import TerminatedError, ending_cleanly, progress_line, say, without_ctrl_c
 
 if TYPE_CHECKING:
     from foamfit.report.folder import Result
@@ -63,7 +63,7 @@ class _Group(click.Group):
         kwargs["standalone_mode"] = False
         gc.set_threshold(100_000, 20, 10)  # imported objects took it a quarter of a fit
         atexit.register(gc.freeze)
-        show_all()
+        terminal.show_all()
         try:
             with ending_cleanly(), as_signalled():
                 code = super().main(*args, **kwargs)
@@ -348,7 +348,5 @@ def compile_solver(quiet: bool, model: str = "bistable") -> None:
     if quiet:  # the log would announce later compilations
         logging.getLogger("foamfit").setLevel(logging.ERROR)
 
-    def tell() -> None:
-        say(f"foamfit: {cache.compiling('the solver')}", err=True)
-
-    precompile.compile_solver(model, None if quiet else tell)
+    tell = None if quiet else lambda: say(f"foamfit: {cache.compiling('the solver')}", err=True)
+    precompile.compile_solver(model, tell)

@@ -11,9 +11,8 @@ import click
 from foamfit.cli import options
 from foamfit.cli.fit import folder_name
 from foamfit.cli.options import COUNT, FILE, Output, compile_solver, declared, main, option
-from foamfit.cli.progress import progress_line
 from foamfit.errors import InputError
-from foamfit.terminal import say
+from foamfit.terminal import progress_line, say
 
 
 @main.command()

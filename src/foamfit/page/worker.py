@@ -20,14 +20,13 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from foamfit.cli.progress import APART, Watcher
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.options import OPTIONS
 from foamfit.solve import cache
 from foamfit.solve.precompile import LOOPS, compile_solver
 from foamfit.springs import laws
 from foamfit.study.processes import FITS, PAGES, context_of
-from foamfit.terminal import ending_cleanly, without_ctrl_c
+from foamfit.terminal import APART, Watcher, ending_cleanly, without_ctrl_c
 
 if TYPE_CHECKING:
     from foamfit.arrays import Array
