@@ -55,18 +55,15 @@ class Curves:
         """Show another model or test, with its sliders."""
         self.turning = turning
         self._show_measured(turning)
-        self.sliders.rows = [
-            row | {"held": self.held.get(name, row["held"])} | self._spans(name, row["factor"])
-            for name, row in turning.rows.items()
-        ]
+        rows = list[dict[str, Any]]()
+        for name, row in turning.rows.items():
+            fit = self.found.get(name, {})
+            given = {"interval": fit.get("ci95"), "range": fit.get("range")}
+            spans = {what: [end / row["factor"] for end in x] for what, x in given.items() if x}
+            rows.append(row | {"held": self.held.get(name, row["held"])} | spans)
+        self.sliders.rows = rows
         self.sliders.waiting = False
         self._draw({})
-
-    def _spans(self, name: str, factor: float) -> dict[str, list[float]]:
-        """Return interval and range of the fit, if there are any, in the unit of the slider."""
-        fit = self.found.get(name, {})
-        given = {"interval": fit.get("ci95"), "range": fit.get("range")}
-        return {what: [end / factor for end in ends] for what, ends in given.items() if ends}
 
     def put(self, values: Mapping[str, float]) -> None:
         """Draw the curves at other values (SI), and move the sliders to them."""

@@ -63,6 +63,7 @@ class Page:
     def __init__(self, test: Path | None = None, port: int = 0) -> None:
         self.port = _free_port(port)
         self.token = secrets.token_urlsafe(24)
+        self.address = f"http://{HOST}:{self.port}/{self.token}/"
         self.folder = Path(tempfile.mkdtemp(prefix="foamfit-page-"))  # for this user only
         self.desks: set[Desk] = set()
         self.test = test
@@ -85,11 +86,6 @@ class Page:
         for one in self.server._http._sockets.values():  # sockets of the windows inherit it
             one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.server.start()
-
-    @property
-    def address(self) -> str:
-        """The address of the page, including the token."""
-        return f"http://{HOST}:{self.port}/{self.token}/"
 
     def close(self) -> None:
         """End the server and all fits, and remove all files."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Unpack
 
 import numpy as np
@@ -50,19 +49,13 @@ class Turning:
     ) -> None:
         """Start at `values` (SI), or at values read off the loop; `options` as for a fit."""
         self.problem: Problem = Options(**options).problem(measurement, model)
+        test, springs = self.problem.measurement, self.problem.model
+        self.law = law_in_words(springs.name, springs.relaxation)
+        self.drive = self.problem.objective.drive
+        self.cycles = len(cycles_of(test)) or 1  # in the history
+        self.measured = self._panels(test.stress, test.displacement)
         self.values = self._guess() if not values else self._at(self.problem.vector(), values)
         self.rows = {name: self._row(name) for name in self.problem.names if self._own(name)}
-        self.drive = self.problem.objective.drive
-
-    @property
-    def law(self) -> str:
-        """The model and its relaxation in words."""
-        return law_in_words(self.problem.model.name, self.problem.model.relaxation)
-
-    @property
-    def cycles(self) -> int:
-        """Number of cycles in the history."""
-        return len(cycles_of(self.problem.measurement)) or 1
 
     @property
     def named(self) -> dict[str, float]:
@@ -102,11 +95,6 @@ class Turning:
         curves = {n: xy for n, xy in self._panels(stress, moved).items() if n in self.measured}
         points = springs[0].corners if len(springs) == 1 and not problem.model.relaxation else {}
         return Drawn(curves, problem.objective.misfit(simulated), points)
-
-    @cached_property
-    def measured(self) -> dict[str, tuple[Array, Array]]:
-        """The measured curves by the name of their panel, SI."""
-        return self._panels(self.problem.measurement.stress, self.problem.measurement.displacement)
 
     def _panels(self, stress: Array | None, moved: Array | None) -> dict[str, tuple[Array, Array]]:
         """Return curves (x, y) of a stress (Pa) and a displacement (m) by the name of the panel."""
