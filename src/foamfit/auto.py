@@ -47,27 +47,24 @@ from foamfit.trust.intervals import Announce, Choice
 _OWN = [law.kind for law in map(laws.law, laws.PAPER) if law.hysteretic and not law.word]
 _SLOW = [kind for kind in _OWN if laws.law(kind).remembers]
 _QUICK = [kind for kind in _OWN if kind not in _SLOW]
-_ALL = dict.fromkeys(FREED, True)
+_FREED = [with_options(k, **dict.fromkeys(FREED, True)) for k in _SLOW if laws.options_of(k)]
 LADDER = tuple(
     tuple(Model.parse(name, terms) for name, terms in group)
     for group in (
         [(kind, 0) for kind in _OWN],
         [*((f"linear+{kind}", 0) for kind in _OWN), *((kind, 1) for kind in _OWN)],
-        [(with_options(kind, **_ALL), 1) for kind in _SLOW if laws.options_of(kind)],
+        [(kind, 1) for kind in _FREED],
         [(f"{kind}+{kind}", 0) for kind in _OWN],
         [(f"linear+{kind}+{kind}", 0) for kind in _QUICK],
         [(f"{kind}+{kind}", 1) for kind in _SLOW],
     )
 )
 # Several cycles as one history: only springs with memory, as others repeat the same loop.
-HISTORY = (
-    *((Model.parse(kind, 1),) for kind in _SLOW),
-    *(
-        (Model.parse(with_options(kind, **_ALL), terms),)
-        for kind in _SLOW
-        for terms in (1, 2)
-        if laws.options_of(kind)
-    ),
+HISTORY = tuple(
+    (Model.parse(kind, terms),)
+    for kinds, most in ((_SLOW, 1), (_FREED, 2))
+    for kind in kinds
+    for terms in range(1, most + 1)
 )
 # Number of consecutive groups without a gain after which the comparison ends.
 WITHOUT_GAIN = 2

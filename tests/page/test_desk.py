@@ -146,7 +146,7 @@ displacement = { column = "Gap", counts_down = true }
 [window]
 cycle = 2
 """
-    quantities, rest = desk_module.split_toml(text)
+    quantities, rest = desk_module.split_toml(text.encode())
     assert quantities == {"[specimen] height": "1.19 mm", "[specimen] area": "19.6 mm^2"}
     assert desk_module.join_toml(quantities, rest) == tomllib.loads(text)
     with pytest.raises(InputError, match=r"\[specimen\] height is also filled in above"):

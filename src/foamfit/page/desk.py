@@ -92,10 +92,7 @@ class Desk:
         suffix, now = Path(given).suffix.lower(), time.monotonic()
         if suffix == ".toml":
             self._ahead = now if now - self._came > TOGETHER else -math.inf
-            try:
-                return split_toml(content.decode("utf-8-sig"))
-            except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-                raise InputError(f"The dropped file is not valid TOML: {error}.") from None
+            return split_toml(content)
         if suffix not in ENDINGS:
             raise InputError(
                 f"{given} is not a table; drop a file that ends in {listed(ENDINGS)}, or a TOML."
@@ -240,10 +237,9 @@ def wrong_quantity(message: str) -> str:
     return next((name for name in QUANTITIES if f"{name} " in message), "")
 
 
-def split_toml(text: str) -> Fields:
+def split_toml(dropped: bytes) -> Fields:
     """Split a TOML into the quantities of the page, by name, and the rest as TOML."""
-    document = tomllib.loads(text)
-    found = {}
+    document, found = _document(dropped, "dropped file"), {}
     for name in QUANTITIES:
         table, key = name[1:].split("] ")
         section = document.get(table)
@@ -254,12 +250,12 @@ def split_toml(text: str) -> Fields:
     return found, tomli_w.dumps(document)
 
 
-def _document(rest: str) -> dict[str, Any]:
-    """Return the content of the further TOML; InputError if it is invalid."""
+def _document(toml: str | bytes, what: str = "further TOML") -> dict[str, Any]:
+    """Return the content of a TOML; InputError if it is invalid."""
     try:
-        return tomllib.loads(rest)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"The further TOML is not valid TOML: {error}.") from None
+        return tomllib.loads(toml.decode("utf-8-sig") if isinstance(toml, bytes) else toml)
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"The {what} is not valid TOML: {error}.") from None
 
 
 def join_toml(quantities: Mapping[str, str], rest: str) -> dict[str, Any]:
