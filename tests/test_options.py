@@ -51,7 +51,7 @@ def table():
     ]
     for one in OPTIONS.values():
         command = "" if one.python_only else f"`{f'{one.flag} {one.metavar}'.strip()}`"
-        python = "" if one.command_only else f"`{one.name}`"
+        python = "" if one.name in ("profile", "mcmc") else f"`{one.name}`"
         default = (
             "off"
             if one.kind == "bool"

@@ -46,7 +46,6 @@ class Option:
     metavar: str = ""  # of the value on the command line
     like: str = ""  # an example of a mapping
     python_only: bool = False
-    command_only: bool = False
     frees: tuple[str, ...] = ()  # parameters of some springs that it frees
 
     @property
@@ -247,7 +246,7 @@ _BEFORE = (  # which test and which model
     ),
 )
 _AFTER = (  # what the command calls two of the intervals
-    Option("profile", "bool", "95 % intervals by profile likelihood.", command_only=True),
+    Option("profile", "bool", "95 % intervals by profile likelihood."),
     Option(
         "mcmc",
         "int",
@@ -255,7 +254,6 @@ _AFTER = (  # what the command calls two of the intervals
         least=LEAST_DRAWS,
         most=MOST_DRAWS,
         metavar="N",
-        command_only=True,
     ),
 )
 OPTIONS = {one.name: one for one in (*_BEFORE, *OF_FIT.values(), *_AFTER)}
