@@ -13,7 +13,6 @@ import unicodedata
 from codecs import register_error
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from io import TextIOWrapper
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -31,6 +30,7 @@ RECENT = 0.1  # weight of the last step in the mean pace, from which tqdm tells 
 ENDING = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
+IN_ASCII = "foamfit-in-ascii"  # writes what an encoding lacks, as cp1252 of a pipe on Windows
 # Control characters except tab and new line, and characters that reverse the direction of writing:
 # in a file name they could move the cursor or hide text. Also surrogates (non-UTF-8 bytes).
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -50,13 +50,7 @@ def _in_ascii(error: UnicodeError) -> tuple[str, int]:
     return plain.encode("ascii", "backslashreplace").decode(), error.end
 
 
-register_error("foamfit-in-ascii", _in_ascii)
-
-
-def show_all() -> None:
-    """Let stdout replace characters that its encoding lacks, as cp1252 of a pipe on Windows."""
-    if isinstance(sys.stdout, TextIOWrapper):
-        sys.stdout.reconfigure(errors="foamfit-in-ascii")
+register_error(IN_ASCII, _in_ascii)
 
 
 def say(text: str, *, err: bool = False, newline: bool = True) -> None:

@@ -13,6 +13,7 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -63,7 +64,8 @@ class _Group(click.Group):
         kwargs["standalone_mode"] = False
         gc.set_threshold(100_000, 20, 10)  # imported objects took it a quarter of a fit
         atexit.register(gc.freeze)
-        terminal.show_all()
+        if isinstance(sys.stdout, TextIOWrapper):
+            sys.stdout.reconfigure(errors=terminal.IN_ASCII)
         try:
             with ending_cleanly(), as_signalled():
                 code = super().main(*args, **kwargs)
