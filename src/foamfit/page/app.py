@@ -157,10 +157,7 @@ class Window:
         self._read(partial(self.desk.take, path))
 
     def _read(self, receive: Callable[[], desks.Fields | None], *, table: bool = True) -> None:
-        """Receive files, fill in the values of a TOML, and check the test.
-
-        Without a TOML the fields are cleared, as they belong to the specimen of the previous file.
-        """
+        """Receive files, fill in the values of a TOML, and check the test."""
         try:
             found = receive()
         except (InputError, OSError) as error:
@@ -172,7 +169,7 @@ class Window:
         if new:  # the displayed fit belongs to another test
             self._hide_result("There is no fit yet.")
             self.curves.held, self.curves.found = {}, {}
-        if found is not None:
+        if found is not None:  # without a TOML empty: the fields were those of another specimen
             self.inputs.fill(found, cycles=new)
         self._check()
 

@@ -105,21 +105,14 @@ class Desk:
         return ({}, "") if replaced else None
 
     def take(self, csv: Path) -> Fields | None:
-        """Copy a test from this machine, with its TOML, into the folder of the window.
-
-        Only the command and the example may name such a file, never the browser.
-        """
+        """Copy a test and its TOML from this machine; the browser must never name such a file."""
         known = csv.suffix.lower() in ENDINGS
         cleared = self.receive(csv.name if known else f"{csv.stem}.csv", csv.read_bytes())
         toml = toml_beside(csv)
         return self.receive("test.toml", toml.read_bytes()) if toml.is_file() else cleared
 
     def check(self, quantities: Mapping[str, str], rest: str, arguments: Sequence[str] = ()) -> str:
-        """Read the test as `foamfit check` does, and return the text that it prints.
-
-        `arguments` are the --cycle or --cycles of `foamfit fit`; of several cycles fitted one by
-        one, the first is read. Raises InputError if the test cannot be read.
-        """
+        """Read the test, with --cycle or --cycles, and return what `foamfit check` prints of it."""
         if self.running:
             raise InputError(BUSY)
         self.measurement = None
@@ -132,6 +125,7 @@ class Desk:
             toml.write_text(tomli_w.dumps(document), encoding="utf-8")
             asked = parsed([*arguments])
             wanted = asked["cycle"]
+            # Of several cycles to be fitted one by one the first is read.
             first = next(iter(wanted), None) if isinstance(wanted, tuple) else wanted
             measurement = read_test(self.csv, toml, first, cycles=asked["cycles"])
             # The folder of the window means nothing to a user.
@@ -156,10 +150,7 @@ class Desk:
         return text if self.csv is None else text.replace(self.csv.name, self.given)
 
     def fit(self, arguments: list[str], tell: Callable[[], object] = lambda: None) -> Worker:
-        """Start a fit of the test checked last, with arguments of `foamfit fit`.
-
-        `tell` is called in a thread whenever the fit has news, and at its end.
-        """
+        """Fit the test checked last as `foamfit fit`; a thread calls `tell` at news and the end."""
         if self.csv is None or self.measurement is None:
             raise InputError("The test cannot be read yet; see the error message.")
         if self.running:
