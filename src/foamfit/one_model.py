@@ -138,9 +138,8 @@ class Options(Given):
         """Return the parameters with `fix` and `vary` applied; None without either."""
         if not (self.fix or self.vary):
             return None
-        more: dict[str, Any] = {"time_shift": self.time_shift, "relaxation": self.relaxation}
-        drive = self.drive_for(measurement)
-        made = make_params(measurement, model, drive, **more, **self.of_springs)
+        drive, springs = self.drive_for(measurement), self.parse(model)
+        made = make_params(measurement, springs, drive, time_shift=self.time_shift)
         return fix_and_vary(made, model, self.fix or {}, self.vary)
 
     def problem(
