@@ -18,19 +18,17 @@ from dataclasses import dataclass, field, replace
 from functools import cache as once, partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError, as_signalled
+from foamfit.fitting.problem import Problem
 from foamfit.options import OPTIONS
 from foamfit.solve import cache
 from foamfit.solve.precompile import LOOPS, compile_solver
 from foamfit.springs import laws
 from foamfit.study.processes import FITS, PAGES, context_of
 from foamfit.terminal import APART, Watcher, ending_cleanly, without_ctrl_c
-
-if TYPE_CHECKING:
-    from foamfit.arrays import Array
-    from foamfit.fitting.problem import Problem
 
 COMPILING = "compiling the solver, once after installation"
 STOP = "stop"
