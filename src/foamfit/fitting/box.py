@@ -153,6 +153,12 @@ class Coordinate(NamedTuple):
             return self.ends.ends(*[float(values[place]) for place in self.of])
         return self.ends
 
+    def slopes_at(self, values: list[float]) -> list[tuple[float, float]]:
+        """Return the derivatives of both ends by each of the parameters `of`."""
+        if isinstance(self.ends, Between):
+            return list(self.ends.slopes(*[values[place] for place in self.of]))
+        return []
+
 
 @dataclass(frozen=True, eq=False)
 class Space:
@@ -209,30 +215,6 @@ class Space:
         low, high = np.reshape(limits, (-1, 2)).T.copy()
         return low, high
 
-    @cached_property
-    def _plain(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_], Array, Array]:
-        """Coordinates whose ends are fixed: their numbers, places, and ways of transformation.
-
-        The value is first + step exp(u) if the coordinate is logarithmic, else first + step u.
-        """
-        plain = [(j, one) for j, one in enumerate(self.coordinates) if not one.of]
-        ends = np.reshape([one.ends_at([]) for _, one in plain], (-1, 2))
-        logs = np.array([one.is_logarithmic for _, one in plain], bool)
-        first = np.where(logs, 0.0, ends[:, 0])
-        numbers, places = [j for j, _ in plain], [one.place for _, one in plain]
-        return np.array(numbers, int), np.array(places, int), logs, first, ends[:, 1] - first
-
-    @cached_property
-    def _bounds(self) -> Array:
-        """Least and largest values of the parameters of `_plain`, (2, n), SI."""
-        return np.stack((self.low, self.high))[:, self._plain[1]]
-
-    @cached_property
-    def _dependent(self) -> list[tuple[int, Coordinate, Between]]:
-        """Numbers of coordinates whose ends depend on other parameters, these, and the ends."""
-        every = enumerate(self.coordinates)
-        return [(j, one, one.ends) for j, one in every if one.of and isinstance(one.ends, Between)]
-
     def encode(self, values: Array) -> Array:
         """Return the coordinates of a vector of parameters, moved into the box."""
         out = np.empty(len(self.coordinates))
@@ -246,17 +228,18 @@ class Space:
         margin = 1e-9 * (high - low)
         return np.clip(out, low + margin, high - margin)
 
+    @cached_property
+    def _logarithmic(self) -> NDArray[np.bool_]:
+        """Whether each coordinate is a logarithm, (n_free,)."""
+        return np.array([one.is_logarithmic for one in self.coordinates], bool)
+
     def decode(self, point: Array) -> Array:
         """Return the vector of parameters (SI) at a point of the box."""
-        values, (plain, places, logs, first, step) = self.values.copy(), self._plain
-        u = point[plain]
-        np.exp(u, out=u, where=logs)
-        low, high = self._bounds
-        values[places] = np.minimum(np.maximum(first + step * u, low), high)
-        own = values.tolist()
-        for j, one, ends in self._dependent:
-            (begin, end), (least, most) = ends.ends(*[own[place] for place in one.of]), one.bounds
-            own[one.place] = min(max(begin + point.item(j) * (end - begin), least), most)
+        own, parts = self.values.tolist(), point.copy()
+        np.exp(point, out=parts, where=self._logarithmic)
+        for part, one in zip(parts.tolist(), self.coordinates, strict=True):
+            (first, last), (least, most) = one.ends_at(own), one.bounds
+            own[one.place] = min(max(first + part * (last - first), least), most)
         return self.complete(np.array(own))
 
     def complete(self, values: Array) -> Array:
@@ -269,18 +252,16 @@ class Space:
         `values` is the decoded `point`.
         """
         moves, own = np.zeros((values.size, point.size)), values.tolist()
-        plain, places, logs, first, step = self._plain
-        low, high = self._bounds
-        u = first + step * point[plain]
-        moves[places, plain] = np.where(logs, values[places], step * ((low <= u) & (u <= high)))
-        for j, one, ends in self._dependent:
-            at, part, given = one.place, point.item(j), [own[place] for place in one.of]
-            (begin, end), (least, most) = ends.ends(*given), one.bounds
-            for place, (first_by, last_by) in zip(one.of, ends.slopes(*given), strict=True):
-                moves[at] += (first_by + part * (last_by - first_by)) * moves[place]
-            moves[at, j] = end - begin
-            if not least <= begin + part * (end - begin) <= most:
-                moves[at] = 0.0
+        for j, (part, one) in enumerate(zip(point.tolist(), self.coordinates, strict=True)):
+            if one.is_logarithmic:
+                moves[one.place, j] = own[one.place]
+                continue
+            (first, last), (least, most) = one.ends_at(own), one.bounds
+            if not least <= first + part * (last - first) <= most:
+                continue
+            moves[one.place, j] = last - first
+            for place, (first_by, last_by) in zip(one.of, one.slopes_at(own), strict=True):
+                moves[one.place] += (first_by + part * (last_by - first_by)) * moves[place]
         if self.tied is None:
             return moves
         return follow(self.tied, values, moves, np.full(point.size, 1e-5))
