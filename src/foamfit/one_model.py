@@ -33,7 +33,7 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
 from foamfit.trust.intervals import Announce, Choice, assess, evaluations_of
-from foamfit.trust.ranges import Open, left_open
+from foamfit.trust.refits import Open, left_open
 
 CARRIED = 8  # minima of a poorer model from which the search of a richer one begins
 Progress = Callable[[float, str], None]

@@ -36,8 +36,8 @@ from foamfit.trust import intervals
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.intervals import Choice, assess, mcmc
-from foamfit.trust.profile import trace
-from foamfit.trust.residuals.noise_process import NoiseProcess, noise_processes
+from foamfit.trust.refits import trace
+from foamfit.trust.residuals import NoiseProcess, noise_processes
 
 
 def profile(best: BestPoint, name: str) -> Profile:

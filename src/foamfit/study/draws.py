@@ -29,7 +29,7 @@ from foamfit.study import gain
 from foamfit.study.gain import Draw, Known, Test
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
-from foamfit.trust.ranges import ALIKE
+from foamfit.trust.refits import ALIKE
 
 TRIES = 60  # attempts per draw
 FROM = 3  # number of minima from which springs with fewer branches are sought

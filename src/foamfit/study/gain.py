@@ -3,7 +3,7 @@
 A fit with residuals r, slopes J and noise of covariance Σ has the covariance H⁻¹ (JᵀΣJ) H⁻¹ with
 H = JᵀJ (`trust.covariance`), with contact time and zeros eliminated from J. H and JᵀΣJ of several
 tests add up. Where the law misses the record, the range due to model error is expected by the rule
-of `trust.ranges`: all values whose cost rises by at most `tolerance`, to first order, times the
+of `trust.refits`: all values whose cost rises by at most `tolerance`, to first order, times the
 factor by which the ranges of the tests at hand exceed this.
 """
 
@@ -34,7 +34,7 @@ from foamfit.study.identified import NORMAL
 from foamfit.trust.checklist import may_vanish
 from foamfit.trust.covariance import NOTHING, WEAK
 from foamfit.trust.intervals import FAR, HARDLY_WORSE
-from foamfit.trust.ranges import ALIKE
+from foamfit.trust.refits import ALIKE
 
 TINY, ROUNDING = 1e-6, 1e-12  # least information on a scaled parameter, and over the largest one
 LONGEST = 30.0  # longest contact, in times that the striker takes over the height of the specimen

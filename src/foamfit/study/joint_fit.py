@@ -32,9 +32,8 @@ from foamfit.trust.budget import Settled, judged, settle
 from foamfit.trust.covariance import Ends
 from foamfit.trust.intervals import FAR, HARDLY_WORSE
 from foamfit.trust.joint_point import Error, JointPoint
-from foamfit.trust.profile import PLACED
-from foamfit.trust.ranges import ITERATIONS, TRIALS, left_open, nearer, tolerance
-from foamfit.trust.residuals.law_error import CurveError
+from foamfit.trust.refits import ITERATIONS, PLACED, TRIALS, left_open, nearer, tolerance
+from foamfit.trust.residuals import CurveError
 from foamfit.trust.scatter import Spread, common_and_spread, correlation
 
 ROUNDS = 12  # most iterations between best values and spreads
@@ -180,7 +179,7 @@ def ranges_of(point: JointPoint) -> tuple[dict[str, Ends], list[Together]]:
     A range is the hull of two: the 95 % interval of a value found from the same number of other
     specimens, from fits without each test in turn (a jackknife of n <= `GROUPS` groups, with
     Student's t of n - 1 degrees of freedom); and shared values that fit almost equally well
-    (`trust.ranges`), with the fits at their ends. Empty if there is only noise.
+    (`trust.refits`), with the fits at their ends. Empty if there is only noise.
     """
     refits = list[Together]()
     if not point.uncertainty.errs:
@@ -201,7 +200,7 @@ def own_ranges(point: JointPoint, refits: Sequence[Together]) -> tuple[dict[str,
     """Return the ranges due to model error of the values that each test has for itself.
 
     A range is the hull of values that fit the test almost equally well while the shared values stay
-    where they are (`trust.ranges`), and of those in the `refits` with other shared values.
+    where they are (`trust.refits`), and of those in the `refits` with other shared values.
     """
     out = []
     for t, best in enumerate(point.bests):

@@ -24,8 +24,7 @@ from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
 from foamfit.trust import covariance
 from foamfit.trust.covariance import Block, Covariance, Ends, Uncertainty
-from foamfit.trust.residuals.law_error import CurveError, curve_errors
-from foamfit.trust.residuals.noise_process import basis_of, parts
+from foamfit.trust.residuals import CurveError, basis_of, curve_errors, parts
 
 # Largest leverage of a cycle along a direction; at 1 its residual would be zero there.
 MOST_TAKEN = 0.99

@@ -39,7 +39,7 @@ from foamfit.trust.checklist import (
 )
 from foamfit.trust.covariance import Ends
 from foamfit.trust.identifiability import Insight, look
-from foamfit.trust.residuals.law_error import CurveError
+from foamfit.trust.residuals import CurveError
 
 # A profile narrower than the local interval by more than this factor has stalled.
 STALLED = 2.0

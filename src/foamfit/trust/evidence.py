@@ -32,7 +32,7 @@ from foamfit.parts import law_in_words
 from foamfit.results import Fit
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
-from foamfit.trust.residuals.noise_process import autocorrelation_time
+from foamfit.trust.residuals import autocorrelation_time
 
 # p-value of the runs and neighbours tests below which residuals are not random. One true model in
 # ten to twenty fails by chance.

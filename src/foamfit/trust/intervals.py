@@ -24,7 +24,7 @@ from foamfit.springs.parameters import NUISANCE
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import WEAK, Uncertainty
-from foamfit.trust.profile import BETTER, PLACED, Refit, departures, trace
+from foamfit.trust.refits import BETTER, PLACED, Refit, departures, trace
 
 # "auto" profiles a parameter if the root of the cost departs from a straight line by this share at
 # an end of its local interval.

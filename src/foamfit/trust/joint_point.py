@@ -20,7 +20,7 @@ from foamfit.fitting.together import Together
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import Block, Uncertainty
-from foamfit.trust.residuals.law_error import CurveError
+from foamfit.trust.residuals import CurveError
 
 
 class Error(NamedTuple):
