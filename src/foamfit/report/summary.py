@@ -7,7 +7,6 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 from foamfit.data.measurement import interior_channel
-from foamfit.fitting.branches import covered
 from foamfit.fitting.nuisance import POSITIVE
 from foamfit.report.figures import images
 from foamfit.report.plots import origin_word
@@ -17,6 +16,7 @@ from foamfit.report.tables import count_determined
 from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, counted, percent, warning, wrapped
+from foamfit.trust.best_point import covered
 from foamfit.trust.covariance import RULE
 
 if TYPE_CHECKING:

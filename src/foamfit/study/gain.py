@@ -23,7 +23,6 @@ from foamfit.data.measurement import Measurement
 from foamfit.data.rig import Candidate, Rig
 from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting.branches import unreached
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.report.studies.plan import Expected
@@ -31,6 +30,7 @@ from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Impact
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.identified import NORMAL
+from foamfit.trust.best_point import unreached
 from foamfit.trust.checklist import may_vanish
 from foamfit.trust.covariance import NOTHING, WEAK
 from foamfit.trust.intervals import FAR, HARDLY_WORSE

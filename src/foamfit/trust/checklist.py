@@ -16,7 +16,6 @@ from foamfit.data.energy import EnergyAudit
 from foamfit.data.measurement import INTEGRATED, is_clipped
 from foamfit.data.zeros import CONTRADICTED
 from foamfit.errors import InputError
-from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.levenberg import descend
 from foamfit.fitting.nuisance import TIME_SHIFT
@@ -26,7 +25,7 @@ from foamfit.results import Check, Intervals
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 from foamfit.text import ASKED
 from foamfit.trust import SENTENCES, say
-from foamfit.trust.best_point import BestPoint
+from foamfit.trust.best_point import BestPoint, covered, visited
 from foamfit.trust.covariance import WEAK, covariance
 
 # A fit is unacceptable if the misfit of a curve exceeds this multiple of its standard deviation.

@@ -16,7 +16,6 @@ from foamfit.data.energy import audit, noise_sentences
 from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel
 from foamfit.data.zeros import UNDER_LOAD
 from foamfit.errors import SimulationError
-from foamfit.fitting.branches import visited
 from foamfit.fitting.curves import MOTION_CURVES
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.objective import MODEL_ERROR, Effort
@@ -27,7 +26,7 @@ from foamfit.solve.cache import SPENT
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 from foamfit.text import engineering
 from foamfit.trust import covariance, say
-from foamfit.trust.best_point import BestPoint, cycle_growth
+from foamfit.trust.best_point import BestPoint, cycle_growth, visited
 from foamfit.trust.budget import Settled, changed, judged, make_budget, of_flight, settle
 from foamfit.trust.checklist import (
     POOR,

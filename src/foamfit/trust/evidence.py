@@ -25,12 +25,11 @@ from scipy import special
 
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
-from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import Tracker, squares
 from foamfit.parts import law_in_words
 from foamfit.results import Fit
-from foamfit.trust.best_point import BestPoint
+from foamfit.trust.best_point import BestPoint, branch_of_samples
 from foamfit.trust.covariance import NOTHING
 from foamfit.trust.residuals import autocorrelation_time
 
@@ -299,7 +298,7 @@ class Structure:
 
 
 def find_structure(residual: Array, places: NDArray[np.str_]) -> Structure:
-    """Find the place, as of `fitting.branches.branch_of_samples`, with the largest structure."""
+    """Find the place, as of `branch_of_samples`, with the largest structure."""
     product, branches = residual[1:] * residual[:-1], places[1:]
     sums = {str(place): float(product[branches == place].sum()) for place in np.unique(places)}
     place = max(sums, key=lambda key: sums[key])

@@ -16,11 +16,11 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.fitting.box import scale_in_words
-from foamfit.fitting.branches import sections
 from foamfit.fitting.nuisance import POSITIVE
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import listed
 from foamfit.trust import say
+from foamfit.trust.best_point import sections
 
 if TYPE_CHECKING:
     from foamfit.trust.best_point import BestPoint
