@@ -231,7 +231,7 @@ def identify(
     found = _search(Found(problem, tracker, record), options.vary, given, progress, known)
     if tracker.best_values is None:
         objective, why = found.problem.objective, "check the drive, the heights and the bounds"
-        tried = objective.evaluations
+        tried = objective.spent.evaluations
         try:
             objective.simulate(found.problem.vector())
         except SimulationError as error:
@@ -265,11 +265,11 @@ def judge(
 
 def _pulse(found: Found, best: BestPoint, choice: Choice, progress: Progress) -> Callable[[], None]:
     """Return a function that reports the progress of ranges and intervals by evaluations."""
-    objective, spent = found.problem.objective, found.problem.objective.evaluations
+    spent, before = found.problem.objective.spent, found.problem.objective.spent.evaluations
     share = JUDGED if choice.ranges and best.misfits else JUDGED_NOISE
-    expected = max(share * spent, 1.0) + evaluations_of(best, choice)
+    expected = max(share * before, 1.0) + evaluations_of(best, choice)
     progress(0.0, "intervals")
-    return lambda: progress(min((objective.evaluations - spent) / expected, 0.97), "intervals")
+    return lambda: progress(min((spent.evaluations - before) / expected, 0.97), "intervals")
 
 
 def _assess(
@@ -277,7 +277,7 @@ def _assess(
 ) -> tuple[BestPoint, SearchRecord, Intervals]:
     """Compute ranges and intervals; if they find a better point, start again from it."""
     problem, tracker, record = found.problem, found.tracker, found.record
-    budget = PROFILE_SHARE * problem.objective.evaluations
+    budget = PROFILE_SHARE * problem.objective.spent.evaluations
     left, cost_of_ranges = Open(), math.inf
     for restarts in range(IMPROVEMENTS + 1):
         before = tracker.best_cost

@@ -11,10 +11,10 @@ import time
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import INTEGRATED, Measurement, NoiseLevel
@@ -35,7 +35,6 @@ from foamfit.fitting.curves import (
 )
 from foamfit.fitting.scenes import NOWHERE, Places, Scenes, channel_of
 from foamfit.fitting.starts import thinned
-from foamfit.fitting.weighing import Weighing
 from foamfit.solve.scene import Motion
 from foamfit.springs.model import Model
 
@@ -51,6 +50,9 @@ NORMAL = 1.4826  # standard deviation of normal residuals over their median abso
 RANKING = 1e-3  # allowed error of the simulations that rank starts on a thinned record
 JUMP = 10.0  # ratio of the effects of a mode to both sides of a jump of the residual
 THIN = 0.8  # a record is thinned if at most this fraction of its samples is left
+# Probability at which amplitudes of the motion's modes are no longer credible; one single
+# amplitude may be larger in ten times as many tests (3.5 standard deviations among 20).
+RARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,24 +76,58 @@ class Simulated:
         return {name: rows[1:] for name, rows in self.rows.items()}
 
 
-class Effort(NamedTuple):
-    """What a fit cost: numbers of simulations, and seconds."""
-
-    simulations: int
-    with_derivatives: int  # of these
-    simulating: float  # s, compiled code and what prepares it
-    compiled: float  # s, of these
-    total: float  # s
-
-
 @dataclass
 class Spent:
-    """Simulations so far; an objective made from another one by `replace` counts with it."""
+    """Simulated sets of parameters; an objective made by `replace` counts with its original."""
 
     evaluations: int = 0
     failures: int = 0  # of these
     sloped: int = 0  # with derivatives
     seconds: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Weighing:
+    """Transform of residuals with covariance v + SSᵀ into residuals with covariance v.
+
+    v is diagonal, the noise of each sample. Each column of S is the change of the residual by one
+    standard deviation of a mode of the motion. With S' = S/√v = U d Vᵀ the residual r becomes
+    √v (1 + S'S'ᵀ)^(-1/2) r/√v. `levels` (n,) are √v, `axes` (n, m) is U, and `less` (m,) is
+    1 - (1 + d²)^(-1/2).
+    """
+
+    levels: Array
+    axes: Array
+    less: Array
+    sizes: Array  # d (m,)
+    at: Array  # the parameters at which it was found, SI
+
+    @classmethod
+    def of(cls, uncertain: Array, levels: Array, at: Array) -> Weighing:
+        """Make the transform from S (n, m) and √v (n,)."""
+        axes, size, _ = np.linalg.svd(uncertain / levels[:, None], full_matrices=False)
+        return cls(levels, axes, 1.0 - 1.0 / np.sqrt(1.0 + size**2), size, at)
+
+    def amplitudes(self, residual: Array) -> Array:
+        """Return the residual along the modes over its standard deviation, of modes with d > 1.
+
+        They are standard normal if the motion's uncertainty and noise explain the residual.
+        """
+        along = (residual / self.levels) @ self.axes / np.sqrt(1.0 + self.sizes**2)
+        return np.asarray(along[self.sizes > 1.0])
+
+    def explains(self, residual: Array) -> bool:
+        """Return whether noise and the uncertainty of the motion can explain a residual (n,)."""
+        sizes = self.amplitudes(residual) ** 2
+        if not sizes.size:
+            return True
+        most = chdtri(sizes.size, RARE), chdtri(1, 10.0 * RARE / sizes.size)
+        return bool(sizes.sum() <= most[0] and sizes.max() <= most[1])
+
+    def __call__(self, rows: Array) -> Array:
+        """Transform residuals (n,), or columns of their derivatives (n, k)."""
+        along = (rows.T / self.levels) @ self.axes * self.less
+        return np.asarray(rows - (self.levels * (along @ self.axes.T)).T)
 
 
 @dataclass(eq=False)
@@ -330,16 +366,6 @@ class Objective:
             raise
         finally:
             self.spent.seconds += time.perf_counter() - began
-
-    @property
-    def evaluations(self) -> int:
-        """Number of simulated sets of parameters."""
-        return self.spent.evaluations
-
-    @property
-    def failures(self) -> int:
-        """Number of failed simulations."""
-        return self.spent.failures
 
     def residual(self, values: Array) -> Array:
         """Return the weighted residuals of all counted curves and of the priors, dimensionless.

@@ -139,7 +139,7 @@ class Tracker:
     def residual(self, values: Array) -> Array:
         """Return the residual of the objective; SearchStoppedError after the time limit."""
         residual = self.consider(values)
-        if self.pulse is not None and self.objective.evaluations % PULSE == 0:
+        if self.pulse is not None and self.objective.spent.evaluations % PULSE == 0:
             self.pulse()
         if self.deadline is not None and time.monotonic() > self.deadline:
             raise SearchStoppedError
@@ -152,15 +152,15 @@ class Tracker:
 
     def possible(self, values: Array) -> Array | None:
         """Return the residual like `residual`; None if the simulation fails."""
-        failures, residual = self.objective.failures, self.residual(values)
-        return residual if self.objective.failures == failures else None
+        failures, residual = self.objective.spent.failures, self.residual(values)
+        return residual if self.objective.spent.failures == failures else None
 
     def consider(self, values: Array) -> Array:
         """Return the residual of the objective, without a time limit."""
-        failures = self.objective.failures
+        failures = self.objective.spent.failures
         residual = self.objective.residual(values)
         cost = float(residual @ residual)
-        if cost < self.best_cost and self.objective.failures == failures:
+        if cost < self.best_cost and self.objective.spent.failures == failures:
             self.best_cost, self.best_values = cost, values.copy()
             if self.better is not None:
                 self.better(self.best_values)

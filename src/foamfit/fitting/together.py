@@ -87,9 +87,9 @@ class Term:
 
     def residual_at(self, point: Array) -> Array:
         """Return the residual of the test, then of the pulls; infinite if the simulation fails."""
-        values, failures = self.values(point), self.objective.failures
+        values, failures = self.values(point), self.objective.spent.failures
         found = self.objective.residual(values)
-        if self.objective.failures > failures:
+        if self.objective.spent.failures > failures:
             found = np.full(found.size, np.inf)
         off = self.weights * (_logarithm(values[self.pulled]) - point[self.commons])
         return np.append(found, off)

@@ -113,11 +113,11 @@ def _check(key: str, answer: bool | None, *, fatal: bool = False, **facts: Any) 
 
 def _of_search(best: BestPoint, record: SearchRecord) -> Iterator[Check]:
     by, objective = record.stopped, best.problem.objective
-    yield _check("ended", by is None, by=by, count=objective.evaluations)
+    yield _check("ended", by is None, by=by, count=objective.spent.evaluations)
     total = record.descents
     agreeing = record.agreeing if by is None and total else 0
     yield _check("agree", agreeing > 1 if agreeing else None, total=total, agreeing=agreeing)
-    failed, tried = objective.failures, max(objective.evaluations, 1)
+    failed, tried = objective.spent.failures, max(objective.spent.evaluations, 1)
     yield _check("simulated", failed <= 0.5 * tried, failed=failed, tried=tried)
     vibrates = objective.interior_mass and len(best.problem.model.kinds) > 1
     yield _check("vibration", not vibrates)

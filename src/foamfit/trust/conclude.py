@@ -18,7 +18,7 @@ from foamfit.data.zeros import UNDER_LOAD
 from foamfit.errors import SimulationError
 from foamfit.fitting.curves import MOTION_CURVES
 from foamfit.fitting.nuisance import TIME_SHIFT
-from foamfit.fitting.objective import MODEL_ERROR, Effort
+from foamfit.fitting.objective import MODEL_ERROR
 from foamfit.fitting.search import SearchRecord
 from foamfit.parts import ParameterEstimate
 from foamfit.results import Correlation, Curves, Fit, Intervals, Switch
@@ -38,7 +38,6 @@ from foamfit.trust.checklist import (
 )
 from foamfit.trust.covariance import Ends
 from foamfit.trust.identifiability import Insight, look
-from foamfit.trust.residuals import CurveError
 
 # A profile narrower than the local interval by more than this factor has stalled.
 STALLED = 2.0
@@ -101,34 +100,32 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         stopped=record.stopped,
         relaxation=problem.model.relaxation,
         interior_mass=objective.interior_mass,
-        noise=noise_of(best, best.errors if best.names else ()),
+        noise=_noise(best),
         intervals=replace(intervals, draws={}),
         budget=budget,
         priors={prior.name: (prior.mean, prior.sigma) for prior in objective.given},
         weighed_at=() if objective.weighing is None else tuple(objective.weighing.at.tolist()),
         problem=problem,
-        effort=Effort(
-            objective.evaluations,
-            objective.spent.sloped,
-            objective.spent.seconds,
-            SPENT.seconds - record.compiled,
-            total,
-        ),
+        effort={
+            "simulations": objective.spent.evaluations,
+            "with_derivatives": objective.spent.sloped,
+            "simulating": objective.spent.seconds,
+            "compiled": SPENT.seconds - record.compiled,
+            "total": total,
+        },
         draws={n: draw + measurement.origins.get(n, 0.0) for n, draw in intervals.draws.items()},
     )
 
 
-def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[str, Any]]:
+def _noise(best: BestPoint) -> dict[str, dict[str, Any]]:
     """Return the noise of each fitted curve, its source, and residuals and model error, SI.
 
-    `errors` has one entry per fitted curve, or is empty if nothing varies. `law_error` is the RMS
-    model error, or None without it; `law_error_evidence` is the reduction of the Bayesian
-    information criterion by including it. `residual_q95` is the 95th percentile of the absolute
-    residuals.
+    `law_error` is the RMS model error, or None without it; `law_error_evidence` is the reduction of
+    the Bayesian information criterion by including it.
     """
     objective, out = best.problem.objective, {}
-    pairs = zip(objective.rms(best.residual).items(), errors or repeat(None), strict=False)
-    for (name, rms), error in pairs:
+    errors = best.errors if best.names else repeat(None)
+    for (name, rms), error in zip(objective.rms(best.residual).items(), errors, strict=False):
         curve = objective.as_read(name, best.simulated.curves[name])
         residual = curve - objective.measured[name]
         level = objective.noise(name)
@@ -151,9 +148,7 @@ def _notes(best: BestPoint) -> tuple[str, ...]:
     derived = set(MOTION_CURVES) - set(objective.counted) if test.motion == INTEGRATED else ()
     off = {name: objective.off(best.simulated, name) for name in MOTION_CURVES if name in derived}
     text = say(
-        "notes",
-        "all",
-        objective=objective,
+        "notes", "all", objective=objective,
         loops=_inner_loops(best),
         priors=[(p, unit_of(p.name), best.value(p.name)) for p in objective.given],
         off={name: misfit for name, misfit in off.items() if misfit},
@@ -162,7 +157,7 @@ def _notes(best: BestPoint) -> tuple[str, ...]:
         noises=noise_sentences(test),
         floored=[n for n in objective.counted if objective.scale[n] > objective.noise(n).sigma],
         floor=MODEL_ERROR,
-    )
+    )  # fmt: skip
     return tuple(text.splitlines())
 
 
@@ -421,8 +416,8 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
         "aic": aic,
         "aicc": aic + 2 * n_vary * (n_vary + 1) / freedom if freedom > 0 else None,
         "bic": log_likelihood + n_vary * math.log(n),
-        "nfev": objective.evaluations,
-        "n_failed": objective.failures,
+        "nfev": objective.spent.evaluations,
+        "n_failed": objective.spent.failures,
         "n_starts": record.starts,
         "n_descents": record.descents,
         "n_agreeing": record.agreeing,

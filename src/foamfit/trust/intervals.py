@@ -211,10 +211,10 @@ def _by_profiles(
     best: BestPoint, names: Sequence[str], tracker: Tracker, budget: float
 ) -> Intervals:
     """Profile some parameters, until a better point is found or time is up."""
-    allowed = tracker.objective.evaluations + budget
+    allowed = tracker.objective.spent.evaluations + budget
     profiles, better = list[Profile](), None
     for name in names:
-        if tracker.objective.evaluations >= allowed:
+        if tracker.objective.spent.evaluations >= allowed:
             break
         profile, better = trace(best, name, tracker)
         profiles.append(profile)

@@ -284,7 +284,7 @@ def refits_alike(best: BestPoint, tracker: Tracker, allowed: float) -> Iterator[
     """
     inverse = np.linalg.pinv(best.scaled.T @ best.scaled, rcond=1e-12, hermitian=True)
     for (name, along), side in product(zip(best.names, inverse, strict=True), (0, 1)):
-        if tracker.objective.evaluations < allowed:
+        if tracker.objective.spent.evaluations < allowed:
             yield from _held(Refit(best, tracker, name), side, along * best.sizes, tolerance(best))
 
 
@@ -312,11 +312,11 @@ def left_open(
     if not best.misfits:
         return Open()
     points = [best.values, *ends_alike(best, minima, tracker)]
-    allowed = tracker.objective.evaluations + budget
+    allowed = tracker.objective.spent.evaluations + budget
     refits = list(refits_alike(best, tracker, allowed))
     refit, further = Refit(best, tracker), list[Array]()
     for point in refits if descents else ():
-        if tracker.objective.evaluations < allowed:
+        if tracker.objective.spent.evaluations < allowed:
             found = refit.descend(refit.space.encode(point), refit.box, DESCENT)
             further.append(refit.values(found))
     values = np.array([*points, *refits])[:, best.places] + 0.0  # turns -0 into 0
