@@ -69,6 +69,14 @@ class ParameterEstimate:
         return replace(self, **missing)
 
 
+def covered(seen: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the branches about which visits to `seen` carry information.
+
+    On the reversible branch of a microscale spring some micro-springs snap through as well.
+    """
+    return (*seen, "snap-through") if "reversible" in seen else seen
+
+
 def law_in_words(model: str, relaxation: int = 0, damping: str = "none") -> str:
     """Describe a model, the parameters that its options free, its relaxation and damping in words.
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from foamfit.data.measurement import interior_channel
 from foamfit.fitting.nuisance import POSITIVE
+from foamfit.parts import covered
 from foamfit.report.figures import images
 from foamfit.report.plots import origin_word
 from foamfit.report.readable import Readable, readable
@@ -16,7 +17,6 @@ from foamfit.report.tables import count_determined
 from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, counted, percent, warning, wrapped
-from foamfit.trust.best_point import covered
 from foamfit.trust.covariance import RULE
 
 if TYPE_CHECKING:

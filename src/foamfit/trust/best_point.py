@@ -21,6 +21,7 @@ from foamfit.data.measurement import FROM_VELOCITY
 from foamfit.fitting.nuisance import CONTACT_TIME, POSITIVE, TIME_SHIFT, open_zero
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
+from foamfit.parts import covered
 from foamfit.springs.parameters import split_name
 from foamfit.trust import covariance
 from foamfit.trust.covariance import Block, Covariance, Ends, Uncertainty
@@ -343,14 +344,6 @@ def visited(problem: Problem, simulated: Simulated) -> dict[str, tuple[str, ...]
     for _, spring, *numbers, _ in simulated.motion.switches:
         seen[int(spring)] += [laws[int(spring)].named_branch(int(number)) for number in numbers]
     return {f"s{i}": tuple(dict.fromkeys(names)) for i, names in enumerate(seen, 1)}
-
-
-def covered(seen: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the branches about which visits to `seen` carry information.
-
-    On the reversible branch of a microscale spring some micro-springs snap through as well.
-    """
-    return (*seen, "snap-through") if "reversible" in seen else seen
 
 
 def unreached(problem: Problem, simulated: Simulated) -> dict[str, str]:

@@ -20,12 +20,12 @@ from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.levenberg import descend
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.search import SearchRecord, Tracker, squares
-from foamfit.parts import ParameterEstimate
+from foamfit.parts import ParameterEstimate, covered
 from foamfit.results import Check, Intervals
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 from foamfit.text import ASKED
 from foamfit.trust import SENTENCES, say
-from foamfit.trust.best_point import BestPoint, covered, visited
+from foamfit.trust.best_point import BestPoint, visited
 from foamfit.trust.covariance import WEAK, covariance
 
 # A fit is unacceptable if the misfit of a curve exceeds this multiple of its standard deviation.
