@@ -14,7 +14,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
@@ -87,23 +86,23 @@ class Scales:
         """Time under load, s; 1 without time."""
         return 2.0 * self.strain / self.rate if self.rate > 0.0 else 1.0
 
-    def _hundredth(self, name: str) -> float:
-        """Return a hundredth of the time under load, or of the largest value of a channel."""
-        largest = {
-            "stress_zero": self.stress,
-            "displacement_zero": self.strain * self.height,
-            "acceleration_zero": self.height / self.duration**2,
-        }
-        return 0.01 * largest.get(name, self.duration)
-
     def unit(self, scale: str) -> float:
         """Return a scale by the name that `springs.laws.record.Param` gives it."""
         return 1.0 if scale == "one" else float(getattr(self, scale.replace("damping", "eta")))
 
     def of_parameter(self, model: Model, name: str, values: dict[str, float]) -> float:
         """Return the scale of a parameter, in its unit: what its relative change is divided by."""
-        if name in NUISANCE:
-            return abs(values[name]) if name in nuisance.POSITIVE else self._hundredth(name)
+        if name in nuisance.POSITIVE:
+            return abs(values[name])
+        if (
+            name in NUISANCE
+        ):  # a hundredth of the largest value of a channel, or the time under load
+            largest = {
+                "stress_zero": self.stress,
+                "displacement_zero": self.strain * self.height,
+                "acceleration_zero": self.height / self.duration**2,
+            }
+            return 0.01 * largest.get(name, self.duration)
         param = model.param(name)
         if not param.least_size:
             return abs(values[name]) or 1.0
@@ -152,12 +151,6 @@ class Coordinate(NamedTuple):
         if isinstance(self.ends, Between):
             return self.ends.ends(*[float(values[place]) for place in self.of])
         return self.ends
-
-    def slopes_at(self, values: list[float]) -> list[tuple[float, float]]:
-        """Return the derivatives of both ends by each of the parameters `of`."""
-        if isinstance(self.ends, Between):
-            return list(self.ends.slopes(*[values[place] for place in self.of]))
-        return []
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,15 +221,11 @@ class Space:
         margin = 1e-9 * (high - low)
         return np.clip(out, low + margin, high - margin)
 
-    @cached_property
-    def _logarithmic(self) -> NDArray[np.bool_]:
-        """Whether each coordinate is a logarithm, (n_free,)."""
-        return np.array([one.is_logarithmic for one in self.coordinates], bool)
-
     def decode(self, point: Array) -> Array:
         """Return the vector of parameters (SI) at a point of the box."""
         own, parts = self.values.tolist(), point.copy()
-        np.exp(point, out=parts, where=self._logarithmic)
+        logarithmic = np.array([one.is_logarithmic for one in self.coordinates], dtype=bool)
+        np.exp(point, out=parts, where=logarithmic)
         for part, one in zip(parts.tolist(), self.coordinates, strict=True):
             (first, last), (least, most) = one.ends_at(own), one.bounds
             own[one.place] = min(max(first + part * (last - first), least), most)
@@ -260,8 +249,10 @@ class Space:
             if not least <= first + part * (last - first) <= most:
                 continue
             moves[one.place, j] = last - first
-            for place, (first_by, last_by) in zip(one.of, one.slopes_at(own), strict=True):
-                moves[one.place] += (first_by + part * (last_by - first_by)) * moves[place]
+            if isinstance(one.ends, Between):
+                by = one.ends.slopes(*[own[place] for place in one.of])
+                for place, (first_by, last_by) in zip(one.of, by, strict=True):
+                    moves[one.place] += (first_by + part * (last_by - first_by)) * moves[place]
         if self.tied is None:
             return moves
         return follow(self.tied, values, moves, np.full(point.size, 1e-5))

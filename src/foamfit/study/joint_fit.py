@@ -3,7 +3,7 @@
 The best values of a scattering parameter in the tests, its common value and its spread depend on
 each other. For a given spread, a fit pulls the values towards the common value. The values without
 this pull follow from the curvature of the cost, and give common value and spread
-(`trust.scatter`). This is repeated until the spread no longer changes (Laplace's method).
+(`trust.joint_point`). This is repeated until the spread no longer changes (Laplace's method).
 """
 
 from __future__ import annotations
@@ -31,10 +31,9 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import Settled, judged, settle
 from foamfit.trust.covariance import Ends
 from foamfit.trust.intervals import FAR, HARDLY_WORSE
-from foamfit.trust.joint_point import Error, JointPoint
+from foamfit.trust.joint_point import Error, JointPoint, Spread, common_and_spread, correlation
 from foamfit.trust.refits import ITERATIONS, PLACED, TRIALS, left_open, nearer, tolerance
 from foamfit.trust.residuals import CurveError
-from foamfit.trust.scatter import Spread, common_and_spread, correlation
 
 ROUNDS = 12  # most iterations between best values and spreads
 STILL = 0.01  # relative change of the spreads at which these iterations end
@@ -145,7 +144,7 @@ def correlation_of(
 
     It is the correlation of logarithms for parameters with `is_logarithmic`; `undrawn` are the
     logarithms of scattering parameters. Only tests that determine all of these parameters are used;
-    see `trust.scatter.correlation`.
+    see `trust.joint_point.correlation`.
     """
     found, columns, scales = point.found, dict[str, Array](), list[Array]()
     for name in found.own:

@@ -101,11 +101,7 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
 
 
 def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array]:
-    """Return the parameters and the residual after a relative change of a quantity.
-
-    Only parameters that are the quantity itself change. Raises SimulationError if the test cannot
-    be simulated.
-    """
+    """Return the parameters, of which those of the quantity itself change, and the residual."""
     problem, values = best.problem, best.values.copy()
     test = changed(problem.measurement, quantity, share)
     if quantity.startswith("height"):  # a spring's own ± has precedence over that of the specimen

@@ -91,7 +91,7 @@ def make_checklist(
         _visited(best, estimates),
         *_of_intervals(best, estimates, intervals, with_error),
         *_of_priors(best, estimates, with_error),
-        *_recovery(best),
+        *([_check("recovery", False, lost=lost)] if (lost := lost_height(best)) else ()),
         *_of_test(best, balance),
         _time_shift(best, estimates),
         _damping(best),
@@ -183,10 +183,7 @@ def _of_record(best: BestPoint, estimates: Estimates, record: SearchRecord) -> C
 
 
 def _determined(best: BestPoint, estimates: Estimates) -> Check:
-    """Check whether the springs' parameters are determined, or zero with a small upper bound.
-
-    An undetermined nuisance parameter widens the intervals of the others.
-    """
+    """Check whether the springs' parameters are determined, or zero with a small upper bound."""
     own = {name: item for name, item in estimates.items() if name not in NUISANCE}
     vanishing, reasons_of = [name for name in own if _vanishes(best, name, own[name])], {}
     for state in ("not determined", "weak"):
@@ -299,10 +296,7 @@ def _of_test(best: BestPoint, balance: EnergyAudit) -> Iterator[Check]:
 
 
 def _damping(best: BestPoint) -> Check:
-    """Check whether a driven single spring clearly lacks the damping (Pa·s) that was left out.
-
-    Friction in the rig (Pa) looks much like it.
-    """
+    """Check whether a driven single spring lacks damping; friction in the rig looks like it."""
     problem, name = best.problem, "s1_eta"
     if problem.objective.drive == "impact" or not best.names:
         return _check("damping", None)
@@ -338,12 +332,6 @@ def lost_height(best: BestPoint) -> float:
         return 0.0
     share = float(test.displacement[last] / test.displacement.max())
     return share if share > RECOVERED else 0.0
-
-
-def _recovery(best: BestPoint) -> Iterator[Check]:
-    """Check whether the specimen follows the motion back."""
-    if lost := lost_height(best):
-        yield _check("recovery", False, lost=lost)
 
 
 def _time_shift(best: BestPoint, estimates: Estimates) -> Check:

@@ -162,10 +162,7 @@ def _notes(best: BestPoint) -> tuple[str, ...]:
 
 
 def _masses(best: BestPoint) -> dict[str, Any] | None:
-    """Return the effect of interior masses omitted from an impact; None if none were omitted.
-
-    "ended" is the error if the simulation with the masses fails.
-    """
+    """Return the effect of interior masses omitted from an impact, or the error that "ended" it."""
     objective, mass = best.problem.objective, best.problem.measurement.specimen.mass
     if objective.drive != "impact" or objective.interior_mass:
         return None
@@ -242,10 +239,7 @@ def _is_closed(best: BestPoint) -> bool:
 
 
 def _is_led(test: Measurement) -> bool:
-    """Return whether the machine led the motion: loading is straighter in motion than in stress.
-
-    Such a stress bends where the springs switch, and smoothing rounds its bends.
-    """
+    """Return whether the machine led the motion: its stress has bends, which smoothing rounds."""
     if test.displacement is None:
         return False
     n = int(np.argmax(test.displacement)) + 1
@@ -304,10 +298,7 @@ def _correlation(best: BestPoint) -> Correlation:
 def _of_tied(
     best: BestPoint, name: str, varied: Mapping[str, ParameterEstimate]
 ) -> tuple[float | None, Ends | None]:
-    """Return standard error and 95 % interval of a parameter that an expression gives, linearised.
-
-    If it depends on a single varied parameter, its interval follows from that of the other.
-    """
+    """Return the linearised error and 95 % interval of a parameter that an expression gives."""
     if not varied:
         return None, None
     slopes = best.problem.moves(best.values, best.names)[best.problem.index[name]]
@@ -317,6 +308,7 @@ def _of_tied(
     if not 0.0 < half <= covariance.NOTHING * best.problem.sizes((name,), best.values)[0]:
         return None, None
     ends = value - half, value + half
+    # That of a single other parameter need not be symmetric.
     if by.size == 1 and (ci95 := (one := varied[best.names[by[0]]]).ci95) is not None:
         first, last = (value + float(slopes[by[0]]) * (end - one.value) for end in ci95)
         ends = min(first, last), max(first, last)
