@@ -94,9 +94,7 @@ class Scales:
         """Return the scale of a parameter, in its unit: what its relative change is divided by."""
         if name in nuisance.POSITIVE:
             return abs(values[name])
-        if (
-            name in NUISANCE
-        ):  # a hundredth of the largest value of a channel, or the time under load
+        if name in NUISANCE:  # a hundredth of the largest value of a channel, or of the duration
             largest = {
                 "stress_zero": self.stress,
                 "displacement_zero": self.strain * self.height,

@@ -249,12 +249,9 @@ def _is_led(test: Measurement) -> bool:
 
 
 def _estimates(
-    best: BestPoint,
-    insight: Insight | None,
-    intervals: Intervals,
-    settled: Sequence[Settled],
+    best: BestPoint, insight: Insight | None, intervals: Intervals, settled: Sequence[Settled],
     doubts: Mapping[str, Any],
-) -> dict[str, ParameterEstimate]:
+) -> dict[str, ParameterEstimate]:  # fmt: skip
     """Return the estimates of all parameters; their standard errors are also set in lmfit's."""
     problem, out = best.problem, {}
     varied = {}
@@ -316,13 +313,9 @@ def _of_tied(
 
 
 def _varied(
-    best: BestPoint,
-    name: str,
-    insight: Insight,
-    intervals: Intervals,
-    settled: Sequence[Settled],
+    best: BestPoint, name: str, insight: Insight, intervals: Intervals, settled: Sequence[Settled],
     doubts: Mapping[str, Any],
-) -> ParameterEstimate:
+) -> ParameterEstimate:  # fmt: skip
     """Return the estimate of a varied parameter whose branch was reached."""
     (low, high), column = best.limits(name), best.names.index(name)
     problem, value, unit = best.problem, best.value(name), unit_of(name)

@@ -66,13 +66,9 @@ class Choice:
 
 
 def assess(
-    best: BestPoint,
-    choice: Choice,
-    searched: Tracker | None = None,
-    minima: Sequence[Array] = (),
-    budget: float = math.inf,
-    announce: Announce = lambda _: None,
-) -> Intervals:
+    best: BestPoint, choice: Choice, searched: Tracker | None = None, minima: Sequence[Array] = (),
+    budget: float = math.inf, announce: Announce = lambda _: None,
+) -> Intervals:  # fmt: skip
     """Compute the requested intervals.
 
     `minima` are the points at which the descents of the search ended. At the deadline of the

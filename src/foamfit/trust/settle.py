@@ -79,12 +79,9 @@ def descend_again(problem: Problem, tracker: Tracker) -> None:
 
 
 def steps(
-    problem: Problem,
-    tracker: Tracker,
-    asked: Collection[str],
-    given: Collection[str],
+    problem: Problem, tracker: Tracker, asked: Collection[str], given: Collection[str],
     search_held: Callable[[], Sequence[Array]] = tuple,
-) -> Iterator[tuple[Problem, Freed | None]]:
+) -> Iterator[tuple[Problem, Freed | None]]:  # fmt: skip
     """Decide what stays free and weigh the residuals, with descents from the ends of the search.
 
     Yields the problem after each step, and what `keep_to_record` found. Nuisance parameters that
@@ -100,11 +97,9 @@ def steps(
 
 
 def keep_to_record(
-    problem: Problem,
-    tracker: Tracker,
-    asked: Collection[str],
+    problem: Problem, tracker: Tracker, asked: Collection[str],
     search_held: Callable[[], Sequence[Array]] = tuple,
-) -> tuple[Problem, Freed | None]:
+) -> tuple[Problem, Freed | None]:  # fmt: skip
     """Hold contact and zeros where the record shows them, if the law errs more than the noise.
 
     `search_held` searches without them and returns the ends; descents begin from those of both.
