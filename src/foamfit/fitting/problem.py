@@ -234,7 +234,7 @@ class Problem:
     params: lmfit.Parameters
     scales: Scales
     notes: tuple[str, ...] = ()
-    # Nuisance parameters that are held where the record shows them; see `keeping`
+    # Nuisance parameters that are held where the record shows them
     kept: Mapping[str, nuisance.Prior] = field(default_factory=dict)
 
     @property
@@ -288,20 +288,12 @@ class Problem:
         """Return the names of the parameters that vary."""
         return tuple(name for name in self.names if self.params[name].vary)
 
-    def holding(self, name: str, value: float) -> Problem:
-        """Return the problem with a varied parameter fixed at a value; unchanged if it is fixed."""
+    def holding(self, values: Mapping[str, float]) -> Problem:
+        """Return the problem with those parameters that vary fixed at `values`, SI."""
         params = self.params.copy()
-        if name in self.free():
-            params[name].set(value=value, vary=False)
+        for name in values.keys() & self.free():
+            params[name].set(value=values[name], vary=False)
         return replace(self, params=params)
-
-    def keeping(self, shown: Mapping[str, nuisance.Prior]) -> Problem:
-        """Return the problem with free nuisance parameters held where the record shows them."""
-        params = self.params.copy()
-        free = {name: shown[name] for name in self.free() if name in shown}
-        for name, one in free.items():
-            params[name].set(value=one.mean, vary=False)
-        return replace(self, params=params, kept=free)
 
     @cached_property
     def tied(self) -> Tied | None:
@@ -333,10 +325,9 @@ class Problem:
     def space(self, absolute: tuple[str, ...] = ()) -> Space:
         """Return the box of the search; the coordinates of some parameters may be their values."""
         params = [self.params[name] for name in self.names]
-        low, high = np.array([one.min for one in params]), np.array([one.max for one in params])
-        vector = self.vector()
-        free, tied = self.free(), self.tied
-        return Space(self.model, self.names, self.scales, vector, free, low, high, tied, absolute)
+        low, high = np.array([(one.min, one.max) for one in params]).T.copy()
+        own = self.model, self.names, self.scales, self.vector(), self.free()
+        return Space(*own, low, high, self.tied, absolute)
 
     def sizes(self, names: tuple[str, ...], values: Array) -> Array:
         """Return the scales of some parameters at a point."""

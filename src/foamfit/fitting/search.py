@@ -26,7 +26,7 @@ from foamfit.springs.parameters import NUISANCE
 
 Progress = Callable[[float, str], None]
 # Residual at a point of the box, and its derivative by the coordinates.
-Functions = tuple[Callable[[Array], Array], Callable[[Array], Array]]
+Functions = tuple[Callable[[Array], Array], Callable[[Array], levenberg.Jacobian]]
 End = tuple[float, Array]  # cost and coordinates of the end of a descent
 Way = Callable[[Space, Array, Array, np.random.Generator], Array]  # from two points to a child
 
@@ -169,18 +169,16 @@ class Tracker:
 
 def descend(
     tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
-) -> tuple[float, Array]:
+) -> End:
     """Descend inside the box by Levenberg-Marquardt; return cost and coordinates of the end."""
     end = levenberg.descend(*squares(tracker, space), start, space.box, iterations, enough=enough)
     return end.cost, end.point
 
 
 def halve(
-    functions: tuple[Callable[[Array], Array], Callable[[Array], levenberg.Jacobian]],
-    box: tuple[Array, Array],
-    starts: Sequence[Array],
+    functions: Functions, box: tuple[Array, Array], starts: Sequence[Array],
     step: Callable[[float], None] = lambda _: None,
-) -> list[tuple[float, Array]]:
+) -> list[End]:  # fmt: skip
     """Descend from many starts by successive halving; return costs and coordinates of the ends.
 
     After each of the `STAGES` only the better part of the descents goes on (Jamieson & Talwalkar
@@ -214,20 +212,11 @@ def squares(
     return residual, jacobian
 
 
-def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[float, Array]]:
+def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[End]:
     """Points of the box with their costs, cheapest first."""
-    residuals = [tracker.residual(space.decode(point)) for point in points]
-    return sorted(
-        ((float(r @ r), p) for r, p in zip(residuals, points, strict=True)), key=itemgetter(0)
-    )
-
-
-def distinct(ends: list[tuple[float, Array]]) -> list[tuple[int, Array]]:
-    """Return the distinct minima among the ends of descents, best first: count and one end each.
-
-    Ends belong to one minimum if the relative difference of their costs is below `ALIKE`.
-    """
-    return [(len(group), group[0][1]) for group in grouped(ends, ALIKE)]
+    residuals = (tracker.residual(space.decode(point)) for point in points)
+    costs = [float(residual @ residual) for residual in residuals]
+    return sorted(zip(costs, points, strict=True), key=itemgetter(0))
 
 
 def search(
@@ -249,11 +238,10 @@ def search(
     for attempt in range(attempts):
         before, counts = tracker.best_cost, dict[int, int]()
         if tracker.objective.measurement.displacement is not None and not known:
-            found = distinct(_search_loop(tracker, space, points, starts, rng, progress))
-            points = [point for _, point in found]
-            counts = {id(point): count for count, point in found}
-        ranked = rank(tracker, space, points)
-        points = [point for _, point in distinct(ranked)][:most]
+            found = grouped(_search_loop(tracker, space, points, starts, rng, progress), ALIKE)
+            points = [group[0][1] for group in found]
+            counts = {id(group[0][1]): len(group) for group in found}
+        points = [point for _, point in distinct(rank(tracker, space, points))][:most]
         for i, point in enumerate(points):
             progress(ON_CURVES + (REFINED - ON_CURVES) * i / len(points), "curves")
             cost, end = descend(tracker, space, point, 60)
@@ -292,11 +280,11 @@ def leave_minimum(
     ends += halve(functions, space.box, [space.encode(values) for values in chains])
     every = hop(space, ends, functions, rng, patience=patience)
     tracker.met += _near(space, every)
-    tracker.ends = [space.decode(group[0][1]) for group in grouped(every, ALIKE)[:MINIMA]]
+    tracker.ends = [space.decode(point) for _, point in distinct(every)[:MINIMA]]
     return [(cost, 1) for cost, _ in every[len(ends) :]]
 
 
-def _near(space: Space, ends: list[tuple[float, Array]]) -> list[Array]:
+def _near(space: Space, ends: Sequence[End]) -> list[Array]:
     """Return the parameters of the ends that may fit almost as well as the best one.
 
     None of a single spring, of which refits near the best point show what is open.
@@ -332,7 +320,7 @@ def ensure_feasible(tracker: Tracker, space: Space, rng: np.random.Generator) ->
 def _search_loop(
     tracker: Tracker, space: Space, points: list[Array], starts: int,
     rng: np.random.Generator, progress: Progress,
-) -> list[tuple[float, Array]]:  # fmt: skip
+) -> list[End]:  # fmt: skip
     """Descend on the smoothed loop; return costs and ends.
 
     Start values read off the loop are added to `points`. The best point of the loop is passed to
@@ -387,6 +375,11 @@ def grouped(ends: Sequence[End], alike: float) -> list[list[End]]:
     return groups
 
 
+def distinct(ends: Sequence[End], alike: float = ALIKE) -> list[End]:
+    """Return the distinct minima among the ends of descents, best first; see `grouped`."""
+    return [group[0] for group in grouped(ends, alike)]
+
+
 def hop(
     space: Space, ends: Sequence[End], functions: Functions, rng: np.random.Generator,
     patience: int = PATIENCE,
@@ -397,7 +390,7 @@ def hop(
     say how a child is made of two ends. Return all ends.
     """
     ways = *WAYS, *(IN_SERIES if space.model.has_several else ())
-    pool, failed, out = [group[0] for group in grouped(ends, DIFFERENT)][:POOL], 0, [*ends]
+    pool, failed, out = distinct(ends, DIFFERENT)[:POOL], 0, [*ends]
     while failed < patience:
         best = pool[0][0]
         one, other = (pool[int(len(pool) * rng.random() ** 2)][1] for _ in range(2))
@@ -413,7 +406,7 @@ def hop(
         out.append((end.cost, end.point))
         if end.cost < (1.0 - ALIKE) * best:
             failed = 0
-        pool = [group[0] for group in grouped([*pool, out[-1]], DIFFERENT)][:POOL]
+        pool = distinct([*pool, out[-1]], DIFFERENT)[:POOL]
     return out
 
 

@@ -115,9 +115,8 @@ def _held(tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[str])
     """Return the problems of some tests in which parameters of unreached branches are held."""
     seen, out = _reached(tests, vectors, names), list[Problem]()
     for problem, values in zip((one.problem for one in tests), vectors, strict=True):
-        for name in np.array(names)[~seen].tolist():
-            problem = problem.holding(name, float(values[problem.index[name]]))
-        out.append(problem)
+        lost = np.array(names)[~seen].tolist()
+        out.append(problem.holding({name: float(values[problem.index[name]]) for name in lost}))
     return out
 
 

@@ -203,9 +203,8 @@ def own_ranges(point: JointPoint, refits: Sequence[Together]) -> tuple[dict[str,
     """
     out = []
     for t, best in enumerate(point.bests):
-        problem = best.problem
-        for name in (name for name in best.names if name in point.found.shared):
-            problem = problem.holding(name, best.value(name))
+        shared = {name: best.value(name) for name in best.names if name in point.found.shared}
+        problem = best.problem.holding(shared)
         alone = BestPoint(problem, best.values)
         found = left_open(alone, (), Tracker(problem.objective), descents=False).ranges
         for name, ends in found.items():
@@ -258,7 +257,7 @@ def _held(point: JointPoint, name: str, sign: float) -> Together | None:
         if end == value:
             break
         start = point.moved(name, end - value)
-        problems = [problem.holding(name, end) for problem in found.problems]
+        problems = [problem.holding({name: end}) for problem in found.problems]
         try:
             other = fit_linked(problems, found.links, [start], iterations=ITERATIONS)
         except SimulationError:

@@ -377,7 +377,7 @@ def sections(problem: Problem, simulated: Simulated) -> list[str]:
     out = _along(problem, simulated, lambda state: "·".join(state.values()) or "line")
     if np.isfinite(end := simulated.motion.contact_end):
         out[int(np.searchsorted(problem.objective.time, end, side="right")) :] = "free flight"
-    return out.tolist()
+    return list(map(str, out))
 
 
 def branch_of_samples(problem: Problem, simulated: Simulated) -> NDArray[np.str_]:
@@ -391,4 +391,4 @@ def branch_of_samples(problem: Problem, simulated: Simulated) -> NDArray[np.str_
 
     loading = np.arange(problem.objective.time.size) <= np.argmax(problem.measurement.stress)
     ways = np.where(loading, "loading, ", "unloading, ").astype(object)
-    return (ways + _along(problem, simulated, words)).astype(str)
+    return np.asarray(ways + _along(problem, simulated, words), dtype=str)

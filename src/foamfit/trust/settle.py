@@ -54,7 +54,8 @@ def held_by_record(problem: Problem, asked: Collection[str]) -> Problem:
     shown = shown_by(test, objective.drive, late=objective.time_shift)
     if history(test, problem.model) is not None:  # the stress may start above the zero
         shown.pop("displacement_zero", None)
-    return problem.keeping({name: one for name, one in shown.items() if name not in asked})
+    kept = {name: shown[name] for name in problem.free() if name in shown and name not in asked}
+    return replace(problem.holding({name: one.mean for name, one in kept.items()}), kept=kept)
 
 
 def errs(best: BestPoint) -> bool:
@@ -113,9 +114,8 @@ def keep_to_record(
         return problem, None
     if other.best_cost < tracker.best_cost:  # the search with these free had missed a minimum
         values = other.best_values
-    tracker.best_values, tracker.best_cost, tracker.ends = (
-        other.best_values, other.best_cost, other.ends,
-    )  # fmt: skip
+    tracker.best_values, tracker.best_cost = other.best_values, other.best_cost
+    tracker.ends = other.ends
     pairs = zip(problem.names, other.best_values.tolist(), values.tolist(), strict=True)
     springs = {name for name in problem.free() if name not in NUISANCE}
     return held, Freed(
