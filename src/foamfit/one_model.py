@@ -19,7 +19,6 @@ from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.fitting import search
 from foamfit.fitting.curves import check_time_shift, choose_drive
-from foamfit.fitting.minima import in_order, settle_ends
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params, make_problem
 from foamfit.fitting.search import STOPPING, SearchRecord, SearchStoppedError, Tracker, what_stopped
 from foamfit.fitting.starts import carried
@@ -189,7 +188,7 @@ class Found:
         """
         problem, space, cost = self.problem, self.problem.space(), self.tracker.best_cost
         assert self.tracker.best_values is not None  # checked by identify
-        values = in_order(space, problem.objective, self.tracker.best_values) + 0.0  # no -0
+        values = settle.in_order(space, problem.objective, self.tracker.best_values) + 0.0  # no -0
         names, moved = problem.free(), values.copy()
         places = [problem.index[name] for name in names]
         near = AT_LIMIT * problem.sizes(names, values)
@@ -359,7 +358,7 @@ def _search(
         settle.descend_again(problem, tracker)
         for step, freed in settle.steps(problem, tracker, asked, given, search_held):
             problem, record = step, replace(record, freed=freed)
-        settle_ends(tracker, problem.space())
+        settle.settle_ends(tracker, problem.space())
     except STOPPING as error:
         if tracker.best_values is None and coarse.best_values is not None:
             tracker.consider(coarse.best_values)

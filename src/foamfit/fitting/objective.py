@@ -330,10 +330,7 @@ class Objective:
         return level
 
     def _samples(self, name: str) -> NDArray[np.intp]:
-        """Return the indices of the samples that count: measured ones without outliers.
-
-        A stress along a motion that does not drive counts where both were measured.
-        """
+        """Return the indices of the samples that count: measured ones without outliers."""
         channel, every = channel_of(name), np.ones(self.time.size, dtype=bool)
         counts = self.measurement.sampled.get(channel, every)
         if name == "stress_strain" and not self.driven:

@@ -64,14 +64,10 @@ class Wanted(NamedTuple):
 
 def _stacked(motion: Motion, node: int | None = None) -> Array:
     """Return the base stress, or the displacement of a node, stacked on its derivatives."""
-
-    def of(base_stress: Array, displacement: Array) -> Array:
-        return base_stress if node is None else displacement[..., node, :]
-
-    rows = of(motion.base_stress, motion.displacement)[None]
-    if (slopes := motion.slopes) is None:
-        return rows
-    return np.concatenate([rows, of(slopes.base_stress, slopes.displacement)])
+    every = (motion,) if motion.slopes is None else (motion, motion.slopes)
+    if node is None:
+        return np.vstack([one.base_stress for one in every])
+    return np.vstack([one.displacement[..., node, :] for one in every])
 
 
 @dataclass(eq=False)
@@ -178,13 +174,10 @@ class Scenes:
         return DisplacementDrive(self._moved)
 
     def _make(self, loading: Drive) -> dict[bool, Plan]:
-        """Prepare scenes without and with dashpots; they do not depend on the spring parameters.
-
-        Interior masses are included in impacts only; along a prescribed motion the springs are in
-        equilibrium.
-        """
+        """Prepare scenes without and with dashpots; they do not depend on the spring parameters."""
         specimen, count = self.measurement.specimen, len(self.model.kinds)
         heights, masses = [specimen.height / count] * count, [0.0] * count
+        # Along a prescribed motion the springs are in equilibrium.
         if self.interior_mass and count > 1 and isinstance(loading, Impact):
             if specimen.mass is None:
                 raise InputError(

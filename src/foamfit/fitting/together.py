@@ -277,15 +277,19 @@ class Layout:
         own = tuple(name for name in names if kinds[name] in ("own", "scatter"))
         shared = {name for name in names if kinds[name] == "shared"}
         rated = {name for name in names if kinds[name] in RATES}
-        parents = {n: _parents(problems[0], n) & set(names) for n in names if n not in own}
-        absolute = tuple(n for n, of in parents.items() if of - shared or (of and n in rated))
+        absolute = []
+        for name in names:  # its coordinate may depend on parameters that are not shared
+            of = () if name in NUISANCE else problems[0].model.param(name).of
+            parents = {f"{name.partition('_')[0]}_{short}" for short in of} & set(names)
+            if name not in own and (parents - shared or (parents and name in rated)):
+                absolute.append(name)
         places, count = dict[str, int](), 0
         for name in names:
             if kinds[name] != "own":
                 places[name] = count
                 count += 2 if name in rated else 1
         terms = list[Term]()
-        pairs = zip(problems, _spaces(problems, absolute), strict=True)
+        pairs = zip(problems, _spaces(problems, tuple(absolute)), strict=True)
         for t, (problem, space) in enumerate(pairs):
             at, rates = list[int](), dict[int, partial[tuple[float, float, float]]]()
             coordinates = {problem.names[one.place]: one for one in space.coordinates}
@@ -378,9 +382,3 @@ class Layout:
 def _logarithm(values: Array) -> Array:
     """Return the logarithms of the absolute values of parameters."""
     return np.log(np.maximum(np.abs(values), _TINY))
-
-
-def _parents(problem: Problem, name: str) -> set[str]:
-    """Return the parameters on which the coordinate of a parameter depends."""
-    of = () if name in NUISANCE else problem.model.param(name).of
-    return {f"{name.partition('_')[0]}_{parent}" for parent in of}

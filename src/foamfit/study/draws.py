@@ -21,7 +21,6 @@ from foamfit.arrays import Array, Mask
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import Space
 from foamfit.fitting.links import Links
-from foamfit.fitting.minima import in_order, joint_minima
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Layout, Together, fit_linked
 from foamfit.springs.parameters import NUISANCE
@@ -30,6 +29,7 @@ from foamfit.study.gain import Draw, Known, Test
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING
 from foamfit.trust.refits import ALIKE
+from foamfit.trust.settle import in_order, joint_minima
 
 TRIES = 60  # attempts per draw
 FROM = 3  # number of minima from which springs with fewer branches are sought

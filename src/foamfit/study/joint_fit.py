@@ -19,7 +19,6 @@ from foamfit.arrays import Array
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import is_logarithmic
 from foamfit.fitting.links import RATES, Links
-from foamfit.fitting.minima import joint_minima
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import Tracker
 from foamfit.fitting.together import Together, fit_linked
@@ -34,6 +33,7 @@ from foamfit.trust.intervals import FAR, HARDLY_WORSE
 from foamfit.trust.joint_point import Error, JointPoint, Spread, common_and_spread, correlation
 from foamfit.trust.refits import ITERATIONS, PLACED, TRIALS, left_open, nearer, tolerance
 from foamfit.trust.residuals import CurveError
+from foamfit.trust.settle import joint_minima
 
 ROUNDS = 12  # most iterations between best values and spreads
 STILL = 0.01  # relative change of the spreads at which these iterations end
