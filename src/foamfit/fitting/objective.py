@@ -459,10 +459,8 @@ class Objective:
 
     def rms(self, residual: Array) -> dict[str, float]:
         """Return the RMS deviation of each counted curve in its unit, from a residual."""
-        return {
-            name: float(np.sqrt(np.mean(part**2))) / self.factor(name)
-            for name, part in self.by_curve(residual).items()
-        }
+        parts = self.by_curve(residual).items()
+        return {name: float(np.sqrt(np.mean(own**2))) / self.factor(name) for name, own in parts}
 
     def misfit(self, curves: Simulated) -> dict[str, float | None]:
         """Return the misfit of each curve: RMS of simulated minus measured over the measured range.

@@ -208,10 +208,8 @@ class Scenes:
             adds = () if followed else ("displacement_zero",)  # which moves nothing
             more = [name for _, name in others if name in OF_NUISANCE and name not in adds]
             columns = {name: own.size + k for k, name in enumerate(more)}
-            given = [(-1, OF_NUISANCE[name]) for name in more]
-            directions = np.concatenate(
-                (self.model.directions[places[own]], np.reshape(given, (-1, 2)).astype(np.int64))
-            )
+            given = np.reshape([(-1, OF_NUISANCE[name]) for name in more], (-1, 2)).astype(np.int64)
+            directions = np.concatenate((self.model.directions[places[own]], given))
             site = tuple(r for r, p in enumerate(places[own].tolist()) if p == len(names) - 1)
             found = Wanted(own, directions, others, columns, damped, site)
             self._asked[key] = found

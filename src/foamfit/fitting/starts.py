@@ -199,10 +199,8 @@ def carried(space: Space, below: Space, minima: Iterable[Array]) -> list[Array]:
             was.pop()
             sources[spring] = len(was)
     times = CARRIED_TIMES if space.model.relaxation > below.model.relaxation else (1.0,)
-    return [
-        _carried_one(space, below, values, sources, share)
-        for values, share in product(minima, times)
-    ]
+    pairs = product(minima, times)
+    return [_carried_one(space, below, values, sources, share) for values, share in pairs]
 
 
 def _carried_one(

@@ -198,12 +198,9 @@ def fit_linked(
     start can be simulated.
     """
     layout = Layout.of(tuple(problems), links)
-    functions = layout.residual, layout.jacobian
-    ends = [
-        levenberg.descend(*functions, start, layout.box, iterations, enough=ENOUGH)
-        for start in map(layout.start, starts)
-        if np.all(np.isfinite(layout.residual(start)))
-    ]
+    given, box = (layout.residual, layout.jacobian), layout.box
+    points = [p for p in map(layout.start, starts) if np.isfinite(layout.residual(p)).all()]
+    ends = [levenberg.descend(*given, p, box, iterations, enough=ENOUGH) for p in points]
     if not ends:
         raise SimulationError(
             f"{problems[0].measurement.name}: no start of the fit of {len(problems)} tests can be "

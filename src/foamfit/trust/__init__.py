@@ -21,9 +21,8 @@ from foamfit import text
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-SENTENCES: dict[str, Any] = tomllib.loads(
-    files(__package__).joinpath("sentences.toml").read_text(encoding="utf-8")
-)
+_TEXT = files(__package__).joinpath("sentences.toml").read_text(encoding="utf-8")
+SENTENCES: dict[str, Any] = tomllib.loads(_TEXT)
 
 
 @cache

@@ -313,9 +313,8 @@ def cycle_growth(best: BestPoint) -> float | None:
         return None
     last = spans[max(spans)]
     kept = np.concatenate([objective.kept[name] for name in objective.counted])
-    return growth(
-        best.jacobian, best.residual, np.flatnonzero((kept >= last.start) & (kept < last.stop))
-    )
+    rows = np.flatnonzero((kept >= last.start) & (kept < last.stop))
+    return growth(best.jacobian, best.residual, rows)
 
 
 def growth(jacobian: Array, residual: Array, rows: NDArray[np.intp]) -> float:
@@ -348,14 +347,11 @@ def visited(problem: Problem, simulated: Simulated) -> dict[str, tuple[str, ...]
 
 def unreached(problem: Problem, simulated: Simulated) -> dict[str, str]:
     """Return the parameters without a prior whose branch was never reached, and that branch."""
-    seen, known = visited(problem, simulated), {one.name for one in problem.objective.priors}
+    seen = {spring: covered(names) for spring, names in visited(problem, simulated).items()}
+    known = {one.name for one in problem.objective.priors}
     own = [n for n in problem.model.names if n not in known and split_name(n)[0] >= 0]
     branches = {name: problem.model.param(name).branch for name in own}
-    return {
-        name: branch
-        for name, branch in branches.items()
-        if branch and branch not in covered(seen[name.partition("_")[0]])
-    }
+    return {n: b for n, b in branches.items() if b and b not in seen[n.partition("_")[0]]}
 
 
 def _along(

@@ -62,11 +62,8 @@ def responses(best: BestPoint) -> dict[str, Array]:
     """
     measurement, free = best.problem.measurement, {"delay", *best.problem.free()}
     free |= {"stress_scale"} if nuisance.FORCE_SCALE in free else set()
-    return {
-        quantity: response(best, quantity, sigma / _value(measurement, quantity))
-        for quantity, sigma in measurement.uncertainties.items()
-        if quantity not in free
-    }
+    known = {name: sigma for name, sigma in measurement.uncertainties.items() if name not in free}
+    return {name: response(best, name, s / _value(measurement, name)) for name, s in known.items()}
 
 
 def _value(test: Measurement, quantity: str) -> float:

@@ -203,16 +203,12 @@ def _vanishes(best: BestPoint, name: str, item: ParameterEstimate) -> bool:
 def _visited(best: BestPoint, estimates: Estimates) -> Check:
     needed = [law.needed for law in best.problem.model.laws]
     seen = visited(best.problem, best.simulated)
-    absent = {
-        spring: [branch for branch in branches if branch not in covered(seen[spring])]
-        for spring, branches in zip(seen, needed, strict=True)
-    }
+    pairs = zip(seen, needed, strict=True)
+    absent = {s: [one for one in needs if one not in covered(seen[s])] for s, needs in pairs}
     lost = [f"{branch} of {spring}" for spring, gone in absent.items() for branch in gone]
     # An absent branch is a fault only if a varied parameter, which has its own warning, needs it.
-    depend = any(
-        item.state == "not determined" and absent.get(f"s{split_name(name)[0] + 1}")
-        for name, item in estimates.items()
-    )
+    unknown = [name for name, item in estimates.items() if item.state == "not determined"]
+    depend = any(absent.get(f"s{split_name(name)[0] + 1}") for name in unknown)
     answer = True if not lost else False if depend else None
     every = tuple(dict.fromkeys(chain.from_iterable(needed)))
     return _check("visited", answer, wanted=every, lost=lost)

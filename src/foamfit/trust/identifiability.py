@@ -124,10 +124,9 @@ class Insight:
         change = change / change[me]
         change[me] = 0.0
         order = np.argsort(-np.abs(change), kind="stable")
-        parts = [i for i in order if abs(change[i]) > NAMED * abs(change[order[0]])]
-        return say(
-            "why", "compensated", most=MOST, parts=[(self.names[i], change[i]) for i in parts]
-        )
+        large = [i for i in order if abs(change[i]) > NAMED * abs(change[order[0]])]
+        parts = [(self.names[i], change[i]) for i in large]
+        return say("why", "compensated", most=MOST, parts=parts)
 
 
 def look(best: BestPoint) -> Insight:

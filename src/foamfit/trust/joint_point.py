@@ -80,11 +80,9 @@ class JointPoint:
     @cached_property
     def _own(self) -> list[dict[str, int]]:
         """Place of each own parameter of each test among the unknowns."""
-        places = count(len(self.names))
-        return [
-            {name: next(places) for name in best.names if name in self.found.own}
-            for best in self.bests
-        ]
+        places, own = count(len(self.names)), self.found.own
+        each = [[name for name in best.names if name in own] for best in self.bests]
+        return [dict(zip(names, places, strict=False)) for names in each]
 
     @cached_property
     def _scales(self) -> Array:
@@ -130,10 +128,8 @@ class JointPoint:
                 row[self.names.index(name)] = -1.0
                 rows.append(row * pulls[t])
                 variances.append(float(self.inflations[name][t]) if self.inflations else 1.0)
-        through = np.eye(self._scales.size)
-        return (
-            [Block(np.array(rows), (), (), through, of_priors=np.array(variances))] if rows else []
-        )
+        through, of_priors = np.eye(self._scales.size), np.array(variances)
+        return [Block(np.array(rows), (), (), through, of_priors=of_priors)] if rows else []
 
     def of_common(self, name: str) -> Error:
         """Return the error of a common unknown; NaN for others."""

@@ -150,10 +150,8 @@ def noise_processes(
         squares = [basis[part].T @ image for image, part in zip(images, curves, strict=True)]
         rest = basis[sum(sizes) :]  # priors, of unit variance
         middle = np.sum(squares, axis=0) + rest.T @ rest
-        processes = [
-            _corrected(process, seen, basis[part], image, middle)
-            for process, seen, part, image in zip(processes, sums, curves, images, strict=True)
-        ]
+        every = zip(processes, sums, curves, images, strict=True)
+        processes = [_corrected(p, seen, basis[at], image, middle) for p, seen, at, image in every]
     return processes
 
 

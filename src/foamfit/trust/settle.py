@@ -137,14 +137,11 @@ def keep_to_record(
         values = other.best_values
     tracker.best_values, tracker.best_cost = other.best_values, other.best_cost
     tracker.ends = other.ends
-    pairs = zip(problem.names, other.best_values.tolist(), values.tolist(), strict=True)
-    springs = {name for name in problem.free() if name not in NUISANCE}
-    return held, Freed(
-        tuple(held.kept),
-        _misfit(problem, other.best_values),
-        _misfit(problem, values),
-        {name: (with_record, without) for name, with_record, without in pairs if name in springs},
-    )
+    springs = [name for name in problem.free() if name not in NUISANCE]
+    both = {name: problem.index[name] for name in springs}
+    moved = {n: (float(other.best_values[i]), float(values[i])) for n, i in both.items()}
+    misfits = _misfit(problem, other.best_values), _misfit(problem, values)
+    return held, Freed(tuple(held.kept), *misfits, moved)
 
 
 def _afresh(tracker: Tracker, ends: list[Array]) -> Tracker:
