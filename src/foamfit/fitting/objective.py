@@ -150,7 +150,7 @@ class Objective:
     weighing: Weighing | None = None  # Effect of an uncertain driving motion; see `weigh_motion`
     given: tuple[nuisances.Prior, ...] = ()  # Priors of spring parameters
     erring: bool = False  # Whether the law errs, so that priors count by the scales of the curves
-    followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is already known
+    followed: tuple[SmoothMotion | None, ...] = ()  # `Scenes.motion`, if it is already known
     averaged: float = np.inf  # longest time that a sample averages, s, if the samples are thinned
     glued: bool | None = None  # see `is_glued`; None: as the record shows
     spent: Spent = field(default_factory=Spent)
@@ -238,7 +238,7 @@ class Objective:
 
         Each curve has the same weight in the sum of squares as with all samples.
         """
-        motion = self.motion if self.driven else None
+        motion = self.scenes.motion if self.driven else None
         test = thinned(self.measurement, None if motion is None else motion.at(self.time))
         if test.stress.size > THIN * self.time.size:
             return self
@@ -250,11 +250,6 @@ class Objective:
         pairs = zip(self.counted, self.sizes, few.sizes, strict=True)
         more = {name: self.weights[name] * size / left for name, size, left in pairs}
         return replace(few, weights=self.weights | more)
-
-    @property
-    def motion(self) -> SmoothMotion | None:
-        """The measured motion without its noise, or None; see `driving_motion`."""
-        return self.scenes.motion
 
     def weigh_motion(self, values: Array) -> bool:
         """Weight the residuals by the uncertainty of the driving motion; False if it has none.

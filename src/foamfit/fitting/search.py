@@ -327,7 +327,8 @@ def _search_loop(
     the tracker even if the search is stopped.
     """
     objective = tracker.objective
-    followed = None if objective.motion is None else objective.motion.at(objective.time)
+    motion = objective.scenes.motion
+    followed = None if motion is None else motion.at(objective.time)
     loop = thinned(objective.measurement, followed, loop=True)
     along = Objective(
         loop, objective.model, "displacement", {"stress_strain": 1.0},

@@ -1,8 +1,7 @@
 """The fit of several tests with linked parameters.
 
-The residuals of all tests, each in units of its own noise, are minimised as one sum of squares. A
-parameter has one value for all tests or one per test, scatters about a common value, or follows a
-rate law (`fitting.links`).
+The residuals of all tests, each in units of its own noise, are minimised as one sum of squares;
+`fitting.links` says how their parameters are linked.
 """
 
 from __future__ import annotations

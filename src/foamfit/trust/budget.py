@@ -111,7 +111,7 @@ def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array
         values[best.index[quantity]] *= 1.0 + share
     before = problem.objective
     same = test.displacement is before.measurement.displacement  # not to be smoothed again
-    objective = replace(before, measurement=test, followed=(before.motion,) if same else ())
+    objective = replace(before, measurement=test, followed=(before.scenes.motion,) if same else ())
     return values, objective.compare(objective.simulate(values), values)
 
 

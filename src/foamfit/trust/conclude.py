@@ -124,6 +124,7 @@ def _noise(best: BestPoint) -> dict[str, dict[str, Any]]:
     the Bayesian information criterion by including it.
     """
     objective, out = best.problem.objective, {}
+    smoothed = objective.drive == "displacement" and objective.scenes.motion is not None
     errors = best.errors if best.names else repeat(None)
     for (name, rms), error in zip(objective.rms(best.residual).items(), errors, strict=False):
         curve = objective.as_read(name, best.simulated.curves[name])
@@ -135,7 +136,7 @@ def _noise(best: BestPoint) -> dict[str, dict[str, Any]]:
             "law_error": error.law / objective.factor(name) if error and error.found else None,
             "law_error_evidence": error.evidence if error else None,
             "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,
-            "motion_smoothed": objective.drive == "displacement" and objective.motion is not None,
+            "motion_smoothed": smoothed,
             "residual_q95": float(np.quantile(np.abs(residual[objective.kept[name]]), 0.95)),
         }
     return out

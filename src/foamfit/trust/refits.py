@@ -1,8 +1,9 @@
 """Refits near the best point: profiles of the cost, and ranges due to model error.
 
-A profile is the least cost at fixed values of a parameter. A rise of the cost is divided by
-`Covariance.inflation`, which accounts for correlated noise. If the cost is a parabola, profile and
-local interval are therefore the same.
+A profile is the least cost at fixed values of a parameter. A rise of the cost, divided by
+`Covariance.inflation`, is a χ² of one degree of freedom even if noise is correlated (the adjusted
+likelihood ratio of Chandler & Bate 2007, Biometrika 94, 167). If the cost is a parabola, profile
+and local interval are therefore the same.
 
 With model error, the best point depends on the weights of the samples and on the minimum that the
 search finds. The range of a parameter is the hull of its values over points that follow the curves
@@ -204,8 +205,6 @@ class _Side:
 def trace(best: BestPoint, name: str, tracker: Tracker) -> tuple[Profile, Array | None]:
     """Follow the least cost along a parameter past the 95 % cut to both sides.
 
-    It uses the adjusted likelihood ratio: the rise of the cost over `Covariance.inflation` is a χ²
-    of one degree of freedom even if noise is correlated (Chandler & Bate 2007, Biometrika 94, 167).
     If the deadline or Ctrl-C ends it early, it is incomplete. A point of clearly lower cost than
     the best one, if there is one, is returned too.
     """
