@@ -26,8 +26,7 @@ from foamfit.text import engineering
 # Sets the parameters that depend on others through expressions, in place, in a vector (n,) or in
 # each column (n, m).
 Tied = Callable[[Array], Array]
-# Coordinates of nuisance parameters at their two limits.
-NUISANCE_BOX = (-1.0, 1.0)
+NUISANCE_BOX = (-1.0, 1.0)  # coordinates of nuisance parameters at their two limits
 _TENTHS = np.linspace(0.1, 1.0, 10)  # of the largest motion; the fastest is the rate of a ramp
 _RAMPS = 20  # ramps under load up to which the least relaxation time is that of its scale
 

@@ -17,10 +17,8 @@ from foamfit.arrays import Array
 LOG_RATE, POWER_RATE = "log rate", "power rate"
 RATES = (LOG_RATE, POWER_RATE)
 KINDS = ("shared", "own", "scatter", *RATES)
-# Smallest factor 1 + b x, below which the law has no positive value.
-LEAST_FACTOR = 1e-6
-# Largest absolute slope of a rate law.
-STEEPEST = 5.0
+LEAST_FACTOR = 1e-6  # smallest factor 1 + b x, below which the law has no positive value
+STEEPEST = 5.0  # largest absolute slope of a rate law
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from foamfit.results import Fit
 
 METHOD = "foamfit, multi-start Levenberg-Marquardt"
-# Largest relative difference between the χ² of a result and that of its own residual.
-SAME = 1e-6
+SAME = 1e-6  # largest relative difference between the χ² of a result and that of its own residual
 INSIDE = 1e-3  # distance of a value from its limit, in standard errors
 
 

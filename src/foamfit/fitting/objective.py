@@ -38,8 +38,7 @@ from foamfit.fitting.starts import thinned
 from foamfit.solve.scene import Motion
 from foamfit.springs.model import Model
 
-# Residual after a failed simulation, as a multiple of the measured range.
-PENALTY = 10.0
+PENALTY = 10.0  # residual after a failed simulation, as a multiple of the measured range
 OF_DRIVE = ("those of the drive",)  # default of `Objective.nuisance`
 # Lower limit of the estimated noise, as a fraction of the range of a channel. Fits of the bistable
 # law to measured foams have misfits above 1 %: a smaller noise must not let one channel outweigh

@@ -33,8 +33,7 @@ Way = Callable[[Space, Array, Array, np.random.Generator], Array]  # from two po
 PULSE = 16  # evaluations between two calls of `Tracker.pulse`
 # Fractions of the run time of a search at which its parts begin, as measured.
 DESCENTS, ON_CURVES, REFINED = 0.25, 0.75, 0.95
-# Largest number of rounds; see `_settled`.
-ATTEMPTS = 3
+ATTEMPTS = 3  # largest number of rounds; see `_settled`
 FOUND_AGAIN = 0.02  # relative difference of the costs of descents that agree on the best end
 MISSING = 0.8  # fraction of the noise floor up to which a cost is mere noise
 # Hops in a row on the curves that find nothing better, which ends them: of one spring, and where

@@ -36,8 +36,7 @@ from foamfit.trust.covariance import Ends
 STEP = 1e-4
 # Changes of parameters below this share of the largest one, all over their scales, are rounding.
 ROUNDING = 1e-6
-# A force whose zero is known no better than this share of its peak is doubtful.
-DOUBTFUL = 0.005
+DOUBTFUL = 0.005  # a force whose zero is known no better than this share of its peak is doubtful
 # Nuisance parameters by the source of uncertainty to which they contribute.
 _CONTACT = (nuisance.CONTACT_TIME, *nuisance.ZEROS)
 _STRIKER = (*nuisance.POSITIVE, nuisance.TIME_SHIFT)

@@ -30,21 +30,18 @@ from foamfit.trust.covariance import WEAK, covariance
 
 # A fit is unacceptable if the misfit of a curve exceeds this multiple of its standard deviation.
 UNACCEPTABLE = 0.5
-# A fit is poor if the misfit of a curve exceeds this share of its range.
-POOR = 0.05
+POOR = 0.05  # a fit is poor if the misfit of a curve exceeds this share of its range
 # Largest ratio of residuals to noise that still counts as noise: a stated noise is seldom accurate
 # to better than 10 %, an estimated one to better than 50 %.
 STATED, ESTIMATED = 1.1, 1.5
-# Relative fall of the misfit by free contact and zeros that is not due to noise.
-BOUGHT = 0.02
+BOUGHT = 0.02  # relative fall of the misfit by free contact and zeros that is not due to noise
 # The curves contradict a prior if they differ by more than this many standard deviations of both.
 AGAINST = 3.0
 ALONE = 60  # iterations of a descent without a prior
 # The stress is gone below this share of its peak, and a specimen has recovered below this share of
 # the largest strain.
 GONE, RECOVERED = 0.02, 0.5
-# Residuals are correlated if their autocorrelation time, in samples, exceeds this.
-STRUCTURED = 5.0
+STRUCTURED = 5.0  # residuals are correlated if their autocorrelation time, in samples, exceeds this
 # Largest number of reasons in a warning; more are easier to read in the table of parameters.
 REASONS = 3
 

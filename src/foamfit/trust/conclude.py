@@ -39,8 +39,7 @@ from foamfit.trust.checklist import (
 from foamfit.trust.covariance import Ends
 from foamfit.trust.identifiability import Insight, look
 
-# A profile narrower than the local interval by more than this factor has stalled.
-STALLED = 2.0
+STALLED = 2.0  # a profile narrower than the local interval by more than this factor has stalled
 SHORT = 0.8  # share of the change by friction that a linear step finds, in synthetic records
 UNDER = 0.05  # share of the peak stress, above which a record ends under load
 CLOSED = 0.005  # area of a loop over peak stress times largest strain, below which it is closed

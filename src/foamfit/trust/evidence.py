@@ -36,8 +36,7 @@ from foamfit.trust.residuals import autocorrelation_time
 # p-value of the runs and neighbours tests below which residuals are not random. One true model in
 # ten to twenty fails by chance.
 LEVEL = 0.05
-# p-value below which the residuals certainly contain model error.
-SURE = 1e-4
+SURE = 1e-4  # p-value below which the residuals certainly contain model error
 # Reduction of both AICc and BIC for which a richer model is preferred: "strong" evidence in Kass &
 # Raftery (1995), J. Am. Stat. Assoc. 90, 773.
 MARGIN = 6.0
@@ -47,16 +46,14 @@ SHARE = 0.03
 # A model is not chosen if its misfit is more than this many times that of another model with as
 # many parameters, whatever its prediction.
 WORSE = 2.0
-# Below this misfit over range, residuals are the numerical error of the simulation.
-EXACT = 1e-5
+EXACT = 1e-5  # below this misfit over range, residuals are the numerical error of the simulation
 # Number of blocks in time. With 8, a block removes an entire feature of the loop (turning point,
 # first stress), and its prediction is a matter of chance; from about 24 on the ranking is stable.
 BLOCKS = 24
 # Largest number of Levenberg-Marquardt steps without a block, and the relative gain of the cost
 # below which two successive steps end the fit.
 STEPS, ENOUGH = 20, 1e-3
-# Structure is called bent if a parabola removes more than this share of its squares.
-BENT = 0.6
+BENT = 0.6  # structure is called bent if a parabola removes more than this share of its squares
 
 
 def runs_test(residual: Array) -> float:

@@ -38,8 +38,7 @@ ENOUGH_DRAWS = 40
 HARDLY_WORSE = 2.0
 # A value is far outside its interval beyond this multiple of the width: one, less rounding.
 FAR = 1.0 - 1e-9
-# Iterations of a refit at a value one width outside an interval.
-ITERATIONS = 10
+ITERATIONS = 10  # iterations of a refit at a value one width outside an interval
 # Largest start distance of a walker from the best point along an undetermined direction, over the
 # scales of the parameters.
 FARTHEST = 0.1

@@ -27,8 +27,7 @@ from foamfit.results import Profile
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.residuals import CurveError
 
-# A refit ends if the expected gain of the cost is below this share of the 95 % cut.
-ENOUGH = 1e-4
+ENOUGH = 1e-4  # a refit ends if the expected gain of the cost is below this share of the 95 % cut
 STEPS = 40  # largest number of steps of a refit
 # The first refit is at the end of the local interval. The first step outward from there is this
 # share of half of it, each later one this multiple of the one before.

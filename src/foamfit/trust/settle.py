@@ -45,8 +45,7 @@ MINIMA, NEAR = 12, 1.5
 ITERATIONS, ENOUGH = 60, 1e-3  # of such a descent, and its relative gain at the end
 LEFT = 1e-6  # predicted gain of the sum of squares at which a refinement ends
 SHOWN = 3.0  # standard errors from the zero of the file, from which the fitted one is another
-# Largest RMS deviation from the record over that of plain least squares.
-WORSE = 1.05
+WORSE = 1.05  # largest RMS deviation from the record over that of plain least squares
 # Largest number of minima of a joint fit from which springs are exchanged, and of descents from
 # each but the best.
 EXCHANGES, EXCHANGED = 8, 16
