@@ -18,10 +18,10 @@ from foamfit.codec import plain
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.fitting import search
+from foamfit.fitting.box import carried
 from foamfit.fitting.curves import check_time_shift, choose_drive
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params, make_problem
 from foamfit.fitting.search import STOPPING, SearchRecord, SearchStoppedError, Tracker, what_stopped
-from foamfit.fitting.starts import carried
 from foamfit.options import DRAWS, FREED, STARTS, STARTS_IN_SERIES, Given, Watch
 from foamfit.results import Fit, Intervals
 from foamfit.solve.cache import SPENT

@@ -22,6 +22,7 @@ from foamfit.data.motion import SmoothMotion
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError, raise_signal
 from foamfit.fitting import nuisance as nuisances
+from foamfit.fitting.box import thinned
 from foamfit.fitting.curves import (
     ACCELERATION,
     CURVES,
@@ -34,7 +35,6 @@ from foamfit.fitting.curves import (
     shows_motion,
 )
 from foamfit.fitting.scenes import NOWHERE, Places, Scenes, channel_of
-from foamfit.fitting.starts import thinned
 from foamfit.solve.scene import Motion
 from foamfit.springs.model import Model
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
-from foamfit.fitting.box import Space
+from foamfit.fitting.box import BOX_STARTS, Reading, Space, box_starts, inner_part, thinned
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.starts import BOX_STARTS, Reading, box_starts, inner_part, thinned
 from foamfit.springs.model import exchanges, neighbours
 from foamfit.springs.parameters import NUISANCE
 

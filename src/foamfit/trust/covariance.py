@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from foamfit.arrays import Array
-from foamfit.fitting.box import scale_in_words
-from foamfit.text import percent
+from foamfit.springs.parameters import unit_of
+from foamfit.text import engineering, percent
 from foamfit.trust.residuals import NoiseProcess, noise_processes, parts
 
 Ends = tuple[float, float]
@@ -279,6 +279,13 @@ def wider(ends: Ends, span: Ends | None) -> tuple[Ends, str]:
     if span is not None and span[1] - span[0] > ends[1] - ends[0]:
         return span, "range"
     return ends, "95 % interval"
+
+
+def scale_in_words(name: str, value: float, scale: float) -> str:
+    """Return the scale of a parameter in words: its value, or a number with its unit."""
+    if math.isclose(scale, abs(value), rel_tol=1e-9):
+        return "its value"
+    return engineering(scale, unit_of(name))
 
 
 def state(

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.fitting.box import scale_in_words
 from foamfit.fitting.nuisance import POSITIVE
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import listed
 from foamfit.trust import say
 from foamfit.trust.best_point import sections
+from foamfit.trust.covariance import scale_in_words
 
 if TYPE_CHECKING:
     from foamfit.trust.best_point import BestPoint
