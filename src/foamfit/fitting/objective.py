@@ -448,8 +448,7 @@ class Objective:
 
     def by_curve(self, residual: Array) -> dict[str, Array]:
         """Split a residual into the parts of the counted curves."""
-        parts = np.split(residual[: self.n_data], np.cumsum(self.sizes)[:-1])
-        return dict(zip(self.counted, parts, strict=True))
+        return {name: residual[at] for name, *_, at in self._parts}
 
     def rms(self, residual: Array) -> dict[str, float]:
         """Return the RMS deviation of each counted curve in its unit, from a residual."""

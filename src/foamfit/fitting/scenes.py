@@ -101,8 +101,7 @@ class Scenes:
             if (before := history(test, self.model)) is not None:
                 self.clock, self._earlier = np.append(before[0], self.clock), before[0].size
         self._own = np.searchsorted(self.clock, own) if self.clock.size > own.size else None
-        driving = {"stress": ["stress_time"], "displacement": ["displacement_time"]}
-        absent = driving.get(self.drive, []) + ["stress_time"] * (test.time is None)
+        absent = f"{self.drive}_time", "stress_time" if test.time is None else ""
         self.present = tuple(name for name in self.curves if name not in absent)
         self._largest = 0.0 if test.displacement is None else float(test.displacement.max())  # m
         self._gravity = (test.striker.gravity if test.striker else None) or 0.0
@@ -148,8 +147,7 @@ class Scenes:
     @cached_property
     def _zeros(self) -> dict[str, str]:
         """The nuisance parameter that is added to each curve, if there is one."""
-        channels = {channel: zero for zero, channel in nuisances.ZEROS.items()}
-        zeros = {curve: channels.get(channel_of(curve), "") for curve in self.curves}
+        zeros = {curve: f"{channel_of(curve)}_zero" for curve in self.curves}
         return {curve: zero for curve, zero in zeros.items() if zero in self.nuisance}
 
     def modes(self, smooth: SmoothMotion) -> Array:
@@ -242,10 +240,7 @@ class Scenes:
     def _by_nuisance(
         self, name: str, curve: str, rows: Array, at: dict[str, float], wanted: Wanted
     ) -> Array:
-        """Return the derivative of a curve by a nuisance parameter, (n,).
-
-        `rows` are the curve and its derivatives by the directions of the solver.
-        """
+        """Return the derivative of a curve by a nuisance parameter, (n,); `rows` are the simulated."""
         by = np.full(rows.shape[1], float(self._zeros.get(curve) == name))
         if name == nuisances.FORCE_SCALE and curve in STRESSES:
             return np.asarray((at.get(self._zeros.get(curve, ""), 0.0) - rows[0]) / at[name])
@@ -368,10 +363,7 @@ class Scenes:
         return replace(motion, switches=switches, contact_end=motion.contact_end + contact)
 
     def _late(self, name: str, rows: Array, late: float, column: int | None) -> Array:
-        """Return curves on the clock of the file, whose motion is `late` seconds late.
-
-        `column` is the place of their derivative by this time among the directions.
-        """
+        """Return curves, and in `column` their derivative by `late`, on the clock of the file."""
         by_stress = self.drive == "stress"
         simulated = self.drive == "impact" and name != "stress_strain"
         if simulated or (name in STRESSES) == by_stress:

@@ -319,11 +319,7 @@ def _search_loop(
     tracker: Tracker, space: Space, points: list[Array], starts: int,
     rng: np.random.Generator, progress: Progress,
 ) -> list[End]:  # fmt: skip
-    """Descend on the smoothed loop; return costs and ends.
-
-    Start values read off the loop are added to `points`. The best point of the loop is passed to
-    the tracker even if the search is stopped.
-    """
+    """Descend on the smoothed loop from `points` and from starts read off it; return the ends."""
     objective = tracker.objective
     motion = objective.scenes.motion
     followed = None if motion is None else motion.at(objective.time)
@@ -410,10 +406,7 @@ def hop(
 
 
 def _crossed(space: Space, one: Array, other: Array, rng: np.random.Generator) -> Array:
-    """Return a point with a spring of another point, in half of the cases with its height.
-
-    Springs of one law are taken for each other. The last height follows from the others.
-    """
+    """Return a point with a spring of one law of another point, in half of the cases its height."""
     model, out, source = space.model, space.decode(one), space.decode(other)
     to = int(rng.integers(len(model.kinds)))
     place = int(rng.choice([i for i, law in enumerate(model.laws) if law is model.laws[to]]))

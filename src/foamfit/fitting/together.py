@@ -35,10 +35,7 @@ _TINY, _FAR = 1e-30, 100.0
 def _by_rate(
     kind: str, x: float, logarithmic: bool, v: float, b: float
 ) -> tuple[float, float, float]:
-    """Return a coordinate that follows a rate law, and its derivatives by v and b.
-
-    v is the coordinate at rate0; it may be the logarithm of the parameter.
-    """
+    """Return a coordinate that follows a rate law, v at rate0, and its derivatives by v and b."""
     f, slope = factor(kind, b, x)
     return (v + math.log(f), 1.0, slope / f) if logarithmic else (v * f, f, v * slope)
 

@@ -117,11 +117,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
 
 
 def _noise(best: BestPoint) -> dict[str, dict[str, Any]]:
-    """Return the noise of each fitted curve, its source, and residuals and model error, SI.
-
-    `law_error` is the RMS model error, or None without it; `law_error_evidence` is the reduction of
-    the Bayesian information criterion by including it.
-    """
+    """Return the noise of each fitted curve, its source, and residuals and RMS model error, SI."""
     objective, out = best.problem.objective, {}
     smoothed = objective.drive == "displacement" and objective.scenes.motion is not None
     errors = best.errors if best.names else repeat(None)

@@ -47,15 +47,12 @@ class Insight:
 
     @cached_property
     def _directions(self) -> tuple[Array, Array]:
-        """Standard errors along the principal directions (k,), and the directions as rows (k, k).
-
-        The last direction is the weakest; its error is infinite if the curves do not depend on it.
-        """
+        """Standard errors along the principal directions (k,), and these as rows, weakest last."""
         k = len(self.names)
         triangle = np.linalg.qr(self.triangles.reshape(-1, k), mode="r")
         _, singular, vt = np.linalg.svd(triangle, full_matrices=True)
         tiny = 1e-12 * max(float(singular.max(initial=0.0)), 1e-300)
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore"):  # infinite where the curves do not depend on a direction
             return np.where(singular > tiny, 1.0 / singular, np.inf), vt
 
     def shares(self) -> Array:

@@ -115,10 +115,7 @@ def evaluations_of(best: BestPoint, choice: Choice) -> float:
 
 
 def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
-    """Extend the intervals to other minima that different noise could have made the best.
-
-    Values far outside their intervals, at minima hardly worse than the best, go to `elsewhere`.
-    """
+    """Extend the intervals to minima that other noise could make the best; note values far off."""
     ends, methods = dict(made.ends), dict(made.methods)
     intervals = {name: made.ends.get(name, best.local(name)) for name in best.known}
     for point, _, halves in minima:
