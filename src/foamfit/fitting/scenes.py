@@ -240,7 +240,7 @@ class Scenes:
     def _by_nuisance(
         self, name: str, curve: str, rows: Array, at: dict[str, float], wanted: Wanted
     ) -> Array:
-        """Return the derivative of a curve by a nuisance parameter, (n,); `rows` are the simulated."""
+        """Return the derivative of one of the simulated `rows` by a nuisance parameter, (n,)."""
         by = np.full(rows.shape[1], float(self._zeros.get(curve) == name))
         if name == nuisances.FORCE_SCALE and curve in STRESSES:
             return np.asarray((at.get(self._zeros.get(curve, ""), 0.0) - rows[0]) / at[name])
