@@ -21,11 +21,11 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.fitting.levenberg import Iterate, descend, following
-from foamfit.fitting.minima import in_order
 from foamfit.fitting.search import STOPPING, Tracker, squares, what_stopped
 from foamfit.results import Profile
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.residuals import CurveError
+from foamfit.trust.settle import in_order
 
 ENOUGH = 1e-4  # a refit ends if the expected gain of the cost is below this share of the 95 % cut
 STEPS = 40  # largest number of steps of a refit
