@@ -26,7 +26,7 @@ class ParameterEstimate:
     area, mass and calibration in the TOML; `stderr` and `ci95` do not include it. It is 0 where no
     ± is stated or the test does not determine the parameter, and None in a joint fit.
 
-    The other fields are None in the fit of one test. `kind` is one of `links.KINDS` or "fixed".
+    The other fields are None in the fit of one test. `kind` is one of `options.KINDS` or "fixed".
     `value` is then the common value: for a scattering parameter that of the median specimen, for a
     rate law that at the rate of the median test, for an own parameter the median over the tests,
     which has neither error nor state. `tests` contains the value in each test, unless it is the

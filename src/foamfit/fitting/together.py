@@ -1,14 +1,17 @@
 """The fit of several tests with linked parameters.
 
-The residuals of all tests, each in units of its own noise, are minimised as one sum of squares;
-`fitting.links` says how their parameters are linked.
+The residuals of all tests, each in units of its own noise, are minimised as one sum of squares.
+
+A parameter is shared (one value), own (one value per test), scattering (one value per test,
+log-normal about a common value), or follows a rate law with a common value v and slope b: with
+x = ln(rate/rate0) of a test, v·(1 + b x) or v·(rate/rate0)^b = v·e^(b x).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -19,9 +22,9 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting import levenberg
 from foamfit.fitting.box import Scales, Space
-from foamfit.fitting.links import RATES, STEEPEST, Links, factor, start_of
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import Problem
+from foamfit.options import POWER_RATE, RATES
 from foamfit.springs.parameters import NUISANCE
 
 # A descent ends after two consecutive steps with less than this relative gain, or after ITERATIONS.
@@ -30,6 +33,70 @@ ENOUGH, ITERATIONS = 1e-5, 80
 BLOCKS = 50
 # Least value whose logarithm is taken, and the largest logarithm.
 _TINY, _FAR = 1e-30, 100.0
+LEAST_FACTOR = 1e-6  # smallest factor 1 + b x, below which the law has no positive value
+STEEPEST = 5.0  # largest absolute slope of a rate law
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """The links between the parameters of n tests.
+
+    `kinds` gives one of `KINDS` for each named parameter; all others are own. `log_rates` (n,) are
+    ln(rate/rate0), needed for rate laws. `pulls` (n,) of a scattering parameter are the square
+    roots of the weights of (ln v - ln common value)²; parameters without an entry have no such
+    term.
+    """
+
+    kinds: Mapping[str, str]
+    log_rates: Array | None = None
+    pulls: Mapping[str, Array] = field(default_factory=dict)
+
+    def kind(self, name: str) -> str:
+        """Return the kind of a parameter."""
+        return self.kinds.get(name, "own")
+
+    def x(self, test: int) -> float:
+        """Return ln(rate/rate0) of a test; 0 if no rates are known."""
+        return 0.0 if self.log_rates is None else float(self.log_rates[test])
+
+    def having(self, **kinds: str) -> Links:
+        """Return links with some kinds replaced."""
+        return replace(self, kinds={**self.kinds, **kinds})
+
+    def of(self, tests: list[int]) -> Links:
+        """Return the links of a subset of the tests."""
+        rates = None if self.log_rates is None else self.log_rates[tests]
+        pulls = {name: pull[tests] for name, pull in self.pulls.items()}
+        return replace(self, log_rates=rates, pulls=pulls)
+
+
+def factor(kind: str, b: float, x: float) -> tuple[float, float]:
+    """Return value over common value at x = ln(rate/rate0), and its derivative by b."""
+    if kind == POWER_RATE:
+        value = float(np.exp(b * x))
+        return value, x * value
+    value = 1.0 + b * x
+    return (value, x) if value > LEAST_FACTOR else (LEAST_FACTOR, 0.0)
+
+
+def start_of(kind: str, values: Array, x: Array) -> tuple[float, float]:
+    """Return the common value and slope of the rate law fitted to the values of some tests.
+
+    If the law cannot describe the values, their median and slope zero are returned.
+    """
+    middle = float(np.median(values))
+    if not np.ptp(x) > 0.0:
+        return middle, 0.0
+    if kind == POWER_RATE and np.all(values > 0.0):
+        slope, level = np.polyfit(x, np.log(values), 1)
+        v = float(np.exp(level))
+    else:
+        slope, v = np.polyfit(x, values, 1)
+        slope = slope / v if v else 0.0
+    slope = float(np.clip(slope, -STEEPEST, STEEPEST))
+    if not np.isfinite(v) or v == 0.0 or min(factor(kind, slope, one)[0] for one in x) <= 1e-3:
+        return middle, 0.0
+    return float(v), slope
 
 
 def _by_rate(

@@ -20,9 +20,8 @@ from scipy import stats
 from foamfit.arrays import Array, Mask
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import Space
-from foamfit.fitting.links import Links
 from foamfit.fitting.problem import Problem
-from foamfit.fitting.together import Layout, Together, fit_linked
+from foamfit.fitting.together import Layout, Links, Together, fit_linked
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study import gain
 from foamfit.study.gain import Draw, Known, Test

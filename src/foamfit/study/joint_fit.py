@@ -18,10 +18,10 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import is_logarithmic
-from foamfit.fitting.links import RATES, Links
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import Tracker
-from foamfit.fitting.together import Together, fit_linked
+from foamfit.fitting.together import Links, Together, fit_linked
+from foamfit.options import RATES
 from foamfit.parts import ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 from foamfit.text import counted

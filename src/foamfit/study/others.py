@@ -17,8 +17,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.rig import Candidate, Rig
 from foamfit.fitting import levenberg
-from foamfit.fitting.links import Links
-from foamfit.fitting.together import Layout
+from foamfit.fitting.together import Layout, Links
 from foamfit.springs.model import exchanges
 from foamfit.study import gain
 from foamfit.study.gain import Known, Other, Test

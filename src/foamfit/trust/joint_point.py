@@ -21,8 +21,8 @@ from scipy import stats
 from scipy.optimize import brentq
 
 from foamfit.arrays import Array
-from foamfit.fitting.links import RATES, factor
-from foamfit.fitting.together import Together
+from foamfit.fitting.together import Together, factor
+from foamfit.options import RATES
 from foamfit.trust import covariance
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import Block, Uncertainty
