@@ -21,19 +21,8 @@ from foamfit.data.measurement import INTEGRATED, Measurement, NoiseLevel
 from foamfit.data.motion import SmoothMotion
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError, raise_signal
-from foamfit.fitting import nuisance as nuisances
+from foamfit.fitting import curves, nuisance as nuisances
 from foamfit.fitting.box import thinned
-from foamfit.fitting.curves import (
-    ACCELERATION,
-    CURVES,
-    MOTION_CURVES,
-    check_drive,
-    check_time_shift,
-    checked_weights,
-    interior_curves,
-    is_glued,
-    shows_motion,
-)
 from foamfit.fitting.scenes import NOWHERE, Places, Scenes, channel_of
 from foamfit.solve.scene import Motion
 from foamfit.springs.model import Model
@@ -160,18 +149,20 @@ class Objective:
 
     def __post_init__(self) -> None:
         """Prepare the scenes and the scale of each curve."""
-        check_drive(self.measurement, self.drive)
+        curves.check_drive(self.measurement, self.drive)
         if self.time_shift:
-            check_time_shift(self.measurement, self.drive)
+            curves.check_time_shift(self.measurement, self.drive)
         if self.nuisance == OF_DRIVE:
             self.nuisance = nuisances.names_of(self.drive, time_shift=self.time_shift)
         self.measurement = test = with_noise(self.measurement)
-        self.interior = interior_curves(test, len(self.model.kinds))
+        self.interior = curves.interior_curves(test, len(self.model.kinds))
         self._accelerated = self.drive == "impact" and test.acceleration is not None
-        self.curves = (*CURVES, *((ACCELERATION,) if self._accelerated else ()), *self.interior)
-        self.weights = checked_weights(self.weights, self.curves)
+        felt = (curves.ACCELERATION,) if self._accelerated else ()
+        self.curves = (*curves.CURVES, *felt, *self.interior)
+        self.weights = curves.checked_weights(self.weights, self.curves)
         leaves = self.drive == "impact" or self.model.relaxation or test.last_cycle is not None
-        self.glued = is_glued(test, leaves=bool(leaves)) if self.glued is None else self.glued
+        if self.glued is None:
+            self.glued = curves.is_glued(test, leaves=bool(leaves))
         self.scenes = Scenes(
             test, self.model, self.drive, self.curves, self.interior, self.nuisance, self.rtol,
             self.interior_mass, self.followed, self.averaged, self.glued,
@@ -314,7 +305,7 @@ class Objective:
             measured |= {"displacement_time": test.displacement, "stress_strain": test.stress}
         measured |= {name: test.interior[node] for name, node in self.interior.items()}
         if self._accelerated and test.acceleration is not None:
-            measured[ACCELERATION] = test.acceleration
+            measured[curves.ACCELERATION] = test.acceleration
         return {n: curve for n, curve in measured.items() if n in self.scenes.present}
 
     def noise(self, name: str) -> NoiseLevel:
@@ -331,7 +322,7 @@ class Objective:
             counts = counts & self.measurement.sampled.get("displacement", every)
         outliers = self.measurement.outliers.get(channel)
         if self.drive == "stress":
-            counts = counts & shows_motion(self.scenes.driving(self.time))
+            counts = counts & curves.shows_motion(self.scenes.driving(self.time))
         return np.flatnonzero(counts if outliers is None else counts & ~outliers.left_out)
 
     # ------------------------------------------------------------------ simulation and residual
@@ -371,9 +362,9 @@ class Objective:
         except SimulationError:
             return np.append(np.full(self.n_data, self.penalty), self.off_priors(values))
 
-    def compare(self, curves: Simulated, values: Array) -> Array:
+    def compare(self, simulated: Simulated, values: Array) -> Array:
         """Return the residuals of simulated curves; see `residual`."""
-        off = self._gathered(curves.rows)[0]
+        off = self._gathered(simulated.rows)[0]
         # The stress may be huge near the pole of branch c.
         off = np.maximum(np.minimum(off, self.penalty), -self.penalty)
         off = off if self.weighing is None else self.weighing(off)
@@ -455,15 +446,15 @@ class Objective:
         parts = self.by_curve(residual).items()
         return {name: float(np.sqrt(np.mean(own**2))) / self.factor(name) for name, own in parts}
 
-    def misfit(self, curves: Simulated) -> dict[str, float | None]:
+    def misfit(self, simulated: Simulated) -> dict[str, float | None]:
         """Return the misfit of each curve: RMS of simulated minus measured over the measured range.
 
         Outliers are left out. It is None if the test or the drive does not have the curve, or if
         its motion was integrated from the force and does not count.
         """
-        derived = MOTION_CURVES if self.measurement.motion == INTEGRATED else ()
+        derived = curves.MOTION_CURVES if self.measurement.motion == INTEGRATED else ()
         shown = [name for name in self.curves if name in self.counted or name not in derived]
-        return {name: self.off(curves, name) if name in shown else None for name in self.curves}
+        return {name: self.off(simulated, name) if name in shown else None for name in self.curves}
 
     def look(self, values: Array) -> dict[str, float | None] | None:
         """Return the misfits of all curves, without counting the evaluation; None if it fails."""
@@ -474,10 +465,10 @@ class Objective:
         except SimulationError:
             return None
 
-    def off(self, curves: Simulated, name: str) -> float | None:
+    def off(self, simulated: Simulated, name: str) -> float | None:
         """Return the misfit of one curve; None if it was not measured or simulated."""
-        measured, simulated = self.measured.get(name), curves.curves.get(name)
-        if measured is None or simulated is None:
+        measured, curve = self.measured.get(name), simulated.curves.get(name)
+        if measured is None or curve is None:
             return None
-        miss = (self.as_read(name, simulated) - measured)[self.kept[name]]
+        miss = (self.as_read(name, curve) - measured)[self.kept[name]]
         return float(np.sqrt(np.mean(miss**2)) / np.ptp(measured))

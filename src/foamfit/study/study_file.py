@@ -49,8 +49,8 @@ _KEYS: dict[str, Check] = {
 class Study:
     """The content of a study file.
 
-    `kinds` maps parameters to one of `options.KINDS` or "auto"; `held` maps fixed parameters to their
-    values (SI).
+    `kinds` maps parameters to one of `options.KINDS` or "auto"; `held` maps fixed parameters to
+    their values (SI).
     """
 
     path: Path
