@@ -25,17 +25,9 @@ from foamfit.results import Correlation, Curves, Fit, Intervals, Switch
 from foamfit.solve.cache import SPENT
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 from foamfit.text import engineering
-from foamfit.trust import covariance, say
+from foamfit.trust import checklist, covariance, say
 from foamfit.trust.best_point import BestPoint, cycle_growth, visited
 from foamfit.trust.budget import Settled, changed, judged, make_budget, of_flight, settle
-from foamfit.trust.checklist import (
-    POOR,
-    lost_height,
-    make_checklist,
-    may_vanish,
-    status_of,
-    warnings_of,
-)
 from foamfit.trust.covariance import Ends
 from foamfit.trust.identifiability import Insight, look
 
@@ -60,15 +52,15 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
     settled = settle(best, best.contradictions or of_flight(best))
     doubts = _doubts(best, record, intervals)
     estimates, budget = make_budget(best, _estimates(best, insight, intervals, settled, doubts))
-    checklist = make_checklist(best, estimates, misfit, record, balance, intervals)
+    checks = checklist.make_checklist(best, estimates, misfit, record, balance, intervals)
     springs = best.values[: len(problem.model.names)]
     return Fit(
         measurement=measurement,
         model=problem.model.name,
         drive=objective.drive,
         seed=record.seed,
-        status=status_of(checklist),
-        warnings=warnings_of(checklist),
+        status=checklist.status_of(checks),
+        warnings=checklist.warnings_of(checks),
         chain=problem.model.chain(springs, specimen.height, specimen.area),
         params=problem.told(),
         parameters=estimates,
@@ -94,7 +86,7 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         switches=_switches(best),
         correlation=correlation,
         notes=(*problem.notes, *_notes(best), *intervals.notes),
-        checklist=checklist,
+        checklist=checks,
         insight=insight,
         stopped=record.stopped,
         relaxation=problem.model.relaxation,
@@ -212,11 +204,11 @@ def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict
         "begun": (model.relaxation or objective.drive == "impact")
         and any(UNDER_LOAD in note for note in test.notes),
         "ended": ended if errs and objective.drive != "impact" and ended > UNDER else 0.0,
-        "lost": lost_height(best),
+        "lost": checklist.lost_height(best),
         "stayed": test.last_cycle is None and test.start_strain != 0.0 and _is_closed(best),
         "alone": errs and not (record.stopped or record.led) and 0 < record.agreeing < 2,
         "cornered": next((name for name in several if errs and any(best.at_limits(name))), ""),
-        "off": misfit if misfit > POOR else 0.0,
+        "off": misfit if misfit > checklist.POOR else 0.0,
         "curve": curve,
     }
 
@@ -367,7 +359,7 @@ def _state_of(
         reason = why if math.isfinite(ends[1] - ends[0]) else say("why", "independent")
         return state, insight.combination(name, covariance.NOTHING / 1.96) or reason
     at_bound = value in limits and value != 0.0
-    if may_vanish(name) and ends[0] <= 0.0 <= ends[1] and not at_bound:
+    if checklist.may_vanish(name) and ends[0] <= 0.0 <= ends[1] and not at_bound:
         below = any_param(split_name(name)[1]).admissible == "zero or negative"
         side, end = ("lower", ends[0]) if below else ("upper", ends[1])
         what = what.removesuffix(" interval")
