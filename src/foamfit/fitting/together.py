@@ -411,12 +411,12 @@ class Layout:
                 values = [vectors[t][self.problems[t].index[name]] for t in free]
                 point[place] = np.median(_logarithm(np.array(values)))
                 continue
-            columns = [self.terms[t].names.index(name) for t in free]
-            own = np.array([found[t][j] for t, j in zip(free, columns, strict=True)])
+            columns = {t: self.terms[t].names.index(name) for t in free}
+            own = np.array([found[t][j] for t, j in columns.items()])
             if (kind := links.kind(name)) not in RATES:
                 point[place] = np.median(own)
                 continue
-            logarithmic = self.terms[free[0]].space.coordinates[columns[0]].is_logarithmic
+            logarithmic = self.terms[free[0]].space.coordinates[columns[free[0]]].is_logarithmic
             x = np.array([links.x(t) for t in free])
             v, b = start_of(kind, np.exp(own) if logarithmic else own, x)
             point[place : place + 2] = np.log(v) if logarithmic else v, b
@@ -426,16 +426,13 @@ class Layout:
         """Return the common values at a point, SI; see `Together.common`."""
         out = dict[str, tuple[float, ...]]()
         for name, place in self.common_places.items():
-            if name in self.own:
-                out[name] = (float(np.exp(point[place])),)
-                continue
             t = next(t for t, problem in enumerate(self.problems) if name in problem.free())
             value, kind = float(values[t][self.problems[t].index[name]]), self.links.kind(name)
-            if kind not in RATES:
-                out[name] = (value,)
-                continue
-            b = float(point[place + 1])
-            out[name] = value / factor(kind, b, self.links.x(t))[0], b
+            if kind in RATES:
+                b = float(point[place + 1])
+                out[name] = value / factor(kind, b, self.links.x(t))[0], b
+            else:
+                out[name] = (float(np.exp(point[place])) if name in self.own else value,)
         return out
 
 

@@ -253,10 +253,8 @@ def _estimates(
         if (estimate := varied.get(name)) is None:
             vary, spring = bool(parameter.vary), split_name(name)[0] + 1
             state, key = ("not determined", "unreached") if vary else ("fixed", "held")
-            stderr: float | None = None
-            ends: Ends | None = None
-            if parameter.expr:
-                key, (stderr, ends) = "tied", _of_tied(best, name, varied)
+            stderr, ends = _of_tied(best, name, varied) if parameter.expr else (None, None)
+            key = "tied" if parameter.expr else key
             if (shown := problem.kept.get(name)) is not None:
                 key, stderr, half = "kept", shown.sigma, 1.96 * shown.sigma
                 ends = value - half, value + half
@@ -290,7 +288,7 @@ def _of_tied(
     by = np.flatnonzero(slopes)
     variance = float(slopes[by] @ best.spread.matrix[np.ix_(by, by)] @ slopes[by])
     value, half = best.value(name), 1.96 * math.sqrt(max(variance, 0.0))
-    if not 0.0 < half <= covariance.NOTHING * best.problem.sizes((name,), best.values)[0]:
+    if not 0.0 < half <= covariance.NOTHING * best.size(name):
         return None, None
     ends = value - half, value + half
     # That of a single other parameter need not be symmetric.

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,11 +18,8 @@ from foamfit.fitting.nuisance import POSITIVE
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import listed
 from foamfit.trust import say
-from foamfit.trust.best_point import sections
+from foamfit.trust.best_point import BestPoint, sections
 from foamfit.trust.covariance import scale_in_words
-
-if TYPE_CHECKING:
-    from foamfit.trust.best_point import BestPoint
 
 PART = 0.05  # smallest component of a direction that counts
 NAMED = 0.3  # smallest component, relative to the largest, that is named in a sentence
