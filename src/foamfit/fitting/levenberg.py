@@ -96,10 +96,17 @@ def following(at: Iterate, shift: Array, held: NDArray[np.bool_]) -> list[Array]
 
 
 def descend(
-    residual: Callable[[Array], Array], jacobian: Callable[[Array], Jacobian],
-    start: Array | Iterate, box: tuple[Array, Array] | Array, iterations: int, *,
-    enough: float = 0.0, least: float = 0.0, damping: float = 1e-3, stale: bool = False,
-) -> Iterate:  # fmt: skip
+    residual: Callable[[Array], Array],
+    jacobian: Callable[[Array], Jacobian],
+    start: Array | Iterate,
+    box: tuple[Array, Array] | Array,
+    iterations: int,
+    *,
+    enough: float = 0.0,
+    least: float = 0.0,
+    damping: float = 1e-3,
+    stale: bool = False,
+) -> Iterate:
     """Minimise a sum of squares inside a box; an Iterate continues a descent.
 
     The Jacobian of a `stale` one is that of a nearby point.

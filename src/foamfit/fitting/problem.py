@@ -421,10 +421,17 @@ def prior_of(name: str, value: object) -> nuisance.Prior:
 
 
 def make_problem(
-    measurement: Measurement, model_name: str, drive: str | None, params: lmfit.Parameters | None,
-    weights: Mapping[str, float] | None, interior_mass: bool, *, time_shift: bool = False,
-    relaxation: int = 0, priors: Mapping[str, object] | None = None,
-) -> Problem:  # fmt: skip
+    measurement: Measurement,
+    model_name: str,
+    drive: str | None,
+    params: lmfit.Parameters | None,
+    weights: Mapping[str, float] | None,
+    interior_mass: bool,
+    *,
+    time_shift: bool = False,
+    relaxation: int = 0,
+    priors: Mapping[str, object] | None = None,
+) -> Problem:
     """Return the problem of a fit; `foamfit.fit` describes the arguments.
 
     Raises InputError if the test lacks data for the drive, or if a parameter is unknown.

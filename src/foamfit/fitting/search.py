@@ -174,9 +174,11 @@ def descend(
 
 
 def halve(
-    functions: Functions, box: tuple[Array, Array], starts: Sequence[Array],
+    functions: Functions,
+    box: tuple[Array, Array],
+    starts: Sequence[Array],
     step: Callable[[float], None] = lambda _: None,
-) -> list[End]:  # fmt: skip
+) -> list[End]:
     """Descend from many starts by successive halving; return costs and coordinates of the ends.
 
     After each of the `STAGES` only the better part of the descents goes on (Jamieson & Talwalkar

@@ -249,9 +249,12 @@ class Together:
 
 
 def fit_linked(
-    problems: Sequence[Problem], links: Links, starts: Sequence[Sequence[Array]], *,
+    problems: Sequence[Problem],
+    links: Links,
+    starts: Sequence[Sequence[Array]],
+    *,
     iterations: int = ITERATIONS,
-) -> Together:  # fmt: skip
+) -> Together:
     """Fit several tests of one model together, with linked parameters.
 
     Drives, noise and nuisance parameters may differ between tests; a fixed parameter keeps its

@@ -70,9 +70,13 @@ def input_first(warnings: Iterable[str]) -> tuple[str, ...]:
 
 
 def make_checklist(
-    best: BestPoint, estimates: Estimates, misfit: Mapping[str, float | None], record: SearchRecord,
-    balance: EnergyAudit, intervals: Intervals,
-) -> tuple[Check, ...]:  # fmt: skip
+    best: BestPoint,
+    estimates: Estimates,
+    misfit: Mapping[str, float | None],
+    record: SearchRecord,
+    balance: EnergyAudit,
+    intervals: Intervals,
+) -> tuple[Check, ...]:
     """Answer all questions, in the order of `sentences.toml`."""
     with_error = [name for name in best.names if estimates[name].stderr is not None]
     checks = (

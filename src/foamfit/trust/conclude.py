@@ -136,7 +136,9 @@ def _notes(best: BestPoint) -> tuple[str, ...]:
     derived = set(MOTION_CURVES) - set(objective.counted) if test.motion == INTEGRATED else ()
     off = {name: objective.off(best.simulated, name) for name in MOTION_CURVES if name in derived}
     text = say(
-        "notes", "all", objective=objective,
+        "notes",
+        "all",
+        objective=objective,
         loops=_inner_loops(best),
         priors=[(p, unit_of(p.name), best.value(p.name)) for p in objective.given],
         off={name: misfit for name, misfit in off.items() if misfit},
@@ -145,7 +147,7 @@ def _notes(best: BestPoint) -> tuple[str, ...]:
         noises=noise_sentences(test),
         floored=[n for n in objective.counted if objective.scale[n] > objective.noise(n).sigma],
         floor=MODEL_ERROR,
-    )  # fmt: skip
+    )
     return tuple(text.splitlines())
 
 
@@ -237,9 +239,12 @@ def _is_led(test: Measurement) -> bool:
 
 
 def _estimates(
-    best: BestPoint, insight: Insight | None, intervals: Intervals, settled: Sequence[Settled],
+    best: BestPoint,
+    insight: Insight | None,
+    intervals: Intervals,
+    settled: Sequence[Settled],
     doubts: Mapping[str, Any],
-) -> dict[str, ParameterEstimate]:  # fmt: skip
+) -> dict[str, ParameterEstimate]:
     """Return the estimates of all parameters; their standard errors are also set in lmfit's."""
     problem, out = best.problem, {}
     varied = {}
@@ -299,9 +304,13 @@ def _of_tied(
 
 
 def _varied(
-    best: BestPoint, name: str, insight: Insight, intervals: Intervals, settled: Sequence[Settled],
+    best: BestPoint,
+    name: str,
+    insight: Insight,
+    intervals: Intervals,
+    settled: Sequence[Settled],
     doubts: Mapping[str, Any],
-) -> ParameterEstimate:  # fmt: skip
+) -> ParameterEstimate:
     """Return the estimate of a varied parameter whose branch was reached."""
     (low, high), column = best.limits(name), best.names.index(name)
     problem, value, unit = best.problem, best.value(name), unit_of(name)

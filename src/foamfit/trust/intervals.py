@@ -65,9 +65,13 @@ class Choice:
 
 
 def assess(
-    best: BestPoint, choice: Choice, searched: Tracker | None = None, minima: Sequence[Array] = (),
-    budget: float = math.inf, announce: Announce = lambda _: None,
-) -> Intervals:  # fmt: skip
+    best: BestPoint,
+    choice: Choice,
+    searched: Tracker | None = None,
+    minima: Sequence[Array] = (),
+    budget: float = math.inf,
+    announce: Announce = lambda _: None,
+) -> Intervals:
     """Compute the requested intervals.
 
     `minima` are the points at which the descents of the search ended. At the deadline of the

@@ -296,9 +296,12 @@ class Open:
 
 
 def left_open(
-    best: BestPoint, minima: Sequence[Array], tracker: Tracker, budget: float = math.inf,
+    best: BestPoint,
+    minima: Sequence[Array],
+    tracker: Tracker,
+    budget: float = math.inf,
     descents: bool = True,
-) -> Open:  # fmt: skip
+) -> Open:
     """Find the ranges of the parameters, and nearby minima that the search missed.
 
     The ranges are those of `ends_alike` and `refits_alike`. Without `descents`, which are half to

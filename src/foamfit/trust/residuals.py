@@ -306,9 +306,12 @@ class _Spectrum:
 
 
 def curve_errors(
-    residual: Array, jacobian: Array, sizes: tuple[int, ...], taken: Array | None = None,
+    residual: Array,
+    jacobian: Array,
+    sizes: tuple[int, ...],
+    taken: Array | None = None,
     slow: Collection[int] = (),
-) -> tuple[CurveError, ...]:  # fmt: skip
+) -> tuple[CurveError, ...]:
     """Separate noise and model error in the residual of each curve.
 
     The arguments are those of `noise_processes`, whose result is used where there is no model

@@ -36,6 +36,7 @@ from foamfit.springs.model import exchanges
 from foamfit.springs.parameters import NUISANCE, relaxation_names, split_name
 from foamfit.trust.best_point import BestPoint
 
+SearchHeld = Callable[[], Sequence[Array]]  # searches with contact and zeros held
 # The law errs if its RMS error exceeds the noise, and this share of the scale of the curve, which
 # is at least half a percent of its range.
 OVER_SCALE = 0.2
@@ -100,9 +101,12 @@ def descend_again(problem: Problem, tracker: Tracker) -> None:
 
 
 def steps(
-    problem: Problem, tracker: Tracker, asked: Collection[str], given: Collection[str],
-    search_held: Callable[[], Sequence[Array]] = tuple,
-) -> Iterator[tuple[Problem, Freed | None]]:  # fmt: skip
+    problem: Problem,
+    tracker: Tracker,
+    asked: Collection[str],
+    given: Collection[str],
+    search_held: SearchHeld = tuple,
+) -> Iterator[tuple[Problem, Freed | None]]:
     """Decide what stays free and weigh the residuals, with descents from the ends of the search.
 
     Yields the problem after each step, and what `keep_to_record` found. Nuisance parameters that
@@ -118,9 +122,8 @@ def steps(
 
 
 def keep_to_record(
-    problem: Problem, tracker: Tracker, asked: Collection[str],
-    search_held: Callable[[], Sequence[Array]] = tuple,
-) -> tuple[Problem, Freed | None]:  # fmt: skip
+    problem: Problem, tracker: Tracker, asked: Collection[str], search_held: SearchHeld
+) -> tuple[Problem, Freed | None]:
     """Hold contact and zeros where the record shows them, if the law errs more than the noise.
 
     `search_held` searches without them and returns the ends; descents begin from those of both.
