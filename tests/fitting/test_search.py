@@ -21,7 +21,7 @@ from conftest import (
 )
 from foamfit.data.measurement import Specimen
 from foamfit.fitting import levenberg
-from foamfit.fitting.problem import make_params
+from foamfit.fitting.problem import make_params, make_problem
 
 
 def test_an_impact_is_recovered_within_three_standard_errors():
@@ -86,6 +86,41 @@ def test_fixed_values_bounds_and_expressions_are_kept():
     rows = [matrix[names.index(f"s1_kh_{side}")] for side in ("plus", "minus")]
     assert rows[0] == pytest.approx(rows[1], nan_ok=True)
     assert result.parameters["s1_eps_c"].state == "weak"  # the true value lies outside the bound
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ({"s1_k0": {"min": -1.0, "max": 0.0}}, "s1_k0 between -1 and 0 is .* must be positive"),
+        ({"s1_eps_a": {"min": 1.5, "max": 2.0}}, "s1_eps_a between 1.5 and 2 is not admissible"),
+        ({"s1_k0": {"min": 5e6, "max": 5e6}}, "params cannot be evaluated: .*min == max"),
+        ({"s1_kc": {"expr": "s1_k0 / 0"}}, r"\(s1_kc = s1_k0 / 0\): ZeroDivisionError"),
+        ({"s1_kc": {"expr": "s1_k0"}, "s1_k0": {"expr": "s1_kc"}}, "depend on each other"),
+        ({"share": {}, "s1_kc": {"expr": "share * s1_k0"}}, "'share' is not one of the model"),
+    ],
+)
+def test_parameters_that_no_fit_can_have_are_refused(given, why):
+    params = make_params(synthetic_impact()[1])
+    for name, one in given.items():
+        params.add(name) if name not in params else params[name].set(**one)
+    with pytest.raises(ff.InputError, match=why):
+        ff.fit(synthetic_impact()[1], params=params)
+
+
+def test_one_bound_of_a_nuisance_parameter_is_kept_without_the_other():
+    test, bare = synthetic_impact()[1], lmfit.Parameters()
+    usual = make_params(test)["displacement_zero"]
+    bare.add("displacement_zero", value=0.0, min=0.5 * usual.min)
+    made = make_problem(test, "bistable", None, bare, None, interior_mass=False)
+    one = made.params["displacement_zero"]
+    assert (one.min, one.max) == (0.5 * usual.min, usual.max)
+
+
+def test_parameters_without_bounds_are_searched_like_those_with_bounds():
+    test, bare = synthetic_loop()[1], lmfit.Parameters()
+    bare.add("s1_k0", value=5e6)
+    found = ff.fit(test, params=bare, starts=1)
+    assert found.params["s1_k0"].value == ff.fit(test, starts=1).params["s1_k0"].value
 
 
 @pytest.mark.parametrize("name", ["s1_eta", "displacement_zero"])

@@ -33,7 +33,7 @@ def check(test: Path, specimen: Path | None) -> None:
 
     measurement = read_test(test, specimen)
     if measurement.priors:
-        from foamfit.fitting.problem import prior_of
+        from foamfit.fitting.given import prior_of
 
         for name, value in measurement.priors.items():
             prior_of(name, value)  # refuses what no fit accepts

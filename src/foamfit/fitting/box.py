@@ -223,7 +223,7 @@ class Space:
             else:
                 out[j] = (values[one.place] - first) / (last - first)
         low, high = self.box
-        margin = 1e-9 * (high - low)
+        margin = np.nan_to_num(1e-9 * (high - low), posinf=0.0)  # none of a box without an end
         return np.clip(out, low + margin, high - margin)
 
     def decode(self, point: Array) -> Array:

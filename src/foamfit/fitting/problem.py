@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -16,14 +15,14 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.calibration import balance
 from foamfit.data.measurement import Measurement
-from foamfit.data.units import LARGEST, parse_uncertain
 from foamfit.errors import InputError
 from foamfit.fitting import curves, nuisance
 from foamfit.fitting.box import Scales, Space, Tied, follow, others
+from foamfit.fitting.given import check_admissible, check_strain, copied, prior_of
 from foamfit.fitting.objective import Objective
-from foamfit.springs.laws.record import ADMISSIBLE, Between
+from foamfit.springs.laws.record import Between
 from foamfit.springs.model import Model, with_options
-from foamfit.springs.parameters import NUISANCE, any_param, split_name
+from foamfit.springs.parameters import NUISANCE, split_name
 
 # Why some parameters exist in the impact drive only.
 _MOVED = "a given motion needs no striker; choose the impact drive"
@@ -343,83 +342,6 @@ class Problem:
         return follow(self.tied, values, moves, 1e-5 * self.sizes(names, values))
 
 
-def _copied(params: lmfit.Parameters) -> lmfit.Parameters:
-    """Return a copy, as the caller's must not change; InputError for a wrong expression."""
-    try:
-        own = params.copy()
-        values = own.valuesdict()
-    except (ArithmeticError, NameError, RecursionError, TypeError, ValueError) as error:
-        raise InputError(f"an expression of params cannot be evaluated: {error}") from None
-    for name, expression in ((name, one.expr) for name, one in own.items() if one.expr):
-        if not np.isfinite(values[name]):
-            raise InputError(f"the expression {name} = {expression} gives {values[name]}")
-        if used := {name, *re.findall(r"\w+", expression)} & {*NUISANCE}:
-            raise InputError(
-                f"the expression {name} = {expression} has {min(used)}, which may be held "
-                "where the record shows it; only parameters of springs may be in an expression"
-            )
-    return own
-
-
-def _check_held(params: lmfit.Parameters) -> None:
-    """Raise InputError for a fixed value that is not admissible."""
-    for name, parameter in params.items():
-        if parameter.vary or parameter.expr is not None:
-            continue
-        wanted = "positive" if name in nuisance.POSITIVE else "finite"
-        if name not in NUISANCE:
-            wanted = any_param(split_name(name)[1]).admissible
-        if abs(value := parameter.value) > LARGEST or not ADMISSIBLE[wanted](value):
-            wanted = f"less than {LARGEST:g} (SI)" if abs(value) > LARGEST else wanted
-            raise InputError(f"{name} = {value:g} is not admissible: it must be {wanted}")
-
-
-def _check_strain(params: lmfit.Parameters, measurement: Measurement) -> None:
-    """Raise InputError for a fixed zero of the motion at which the measured strain reaches one."""
-    zero, motion = params.get("displacement_zero"), measurement.displacement
-    if zero is None or zero.vary or motion is None:
-        return
-    strain = (float(motion.max()) - zero.value) / measurement.specimen.height
-    if strain >= 1.0:
-        origin = measurement.origins.get("displacement_zero", 0.0)
-        least = float(motion.max()) - measurement.specimen.height + origin
-        raise InputError(
-            f"displacement_zero = {zero.value + origin:g} m is not admissible: the measured strain "
-            f"would reach {strain:.3g}; it must be larger than {least:g} m"
-        )
-
-
-def prior_of(name: str, value: object) -> nuisance.Prior:
-    """Read a prior of a spring parameter of any law: mean and standard deviation, or a text."""
-    where = f"priors: {name}"
-    if name in NUISANCE:
-        raise InputError(
-            f"{where} is not a parameter of the springs; if the TOML has it, give its ± there"
-        )
-    try:
-        param = any_param(split_name(name)[1])
-    except StopIteration:
-        raise InputError(f"{where} is not a parameter of any law") from None
-    unit = param.unit
-    example = "5.5 ± 0.1 MPa" if unit == "Pa" else f"0.2 ± 0.01 {unit}".rstrip()
-    if isinstance(value, str):
-        mean, sigma = parse_uncertain(value, unit or "", where, example, zero=True)
-    else:
-        try:
-            mean, sigma = map(float, value)  # type: ignore[call-overload]
-        except (TypeError, ValueError):
-            mean, sigma = math.nan, None
-    if sigma is None or not (math.isfinite(mean) and 0.0 < sigma < math.inf):
-        pair = f"({unit or 'a number'}, {unit or 'a number'})"
-        raise InputError(
-            f"{where} = {value!r} must be a mean and a positive standard deviation {pair}, or a "
-            f'text like "{example}"'
-        )
-    if not ADMISSIBLE[wanted := param.admissible](mean):
-        raise InputError(f"{where} = {value!r} is not admissible: its mean must be {wanted}")
-    return nuisance.Prior(name, mean, sigma)
-
-
 def make_problem(
     measurement: Measurement,
     model_name: str,
@@ -458,23 +380,28 @@ def make_problem(
     )  # fmt: skip
     measurement = objective.measurement  # it has the noise of each channel
     wanted = make_params(measurement, model, drive, time_shift=time_shift)
-    params = lmfit.Parameters() if params is None else _copied(params)
+    usual = wanted.valuesdict()
     limits = {name: (one.min, one.max) for name, one in wanted.items() if name in NUISANCE}
-    for name in params:
+    for name in params or ():
         _check_known(f"parameter '{name}'", name, model.name, wanted)
-        wanted[name] = params[name]
+    for name, given_one in (copied(params) if params else {}).items():
+        wanted[name] = given_one
     for name, (low, high) in limits.items():
-        if wanted[name].vary and not math.isfinite(wanted[name].max - wanted[name].min):
+        one = wanted[name]
+        if one.vary and not math.isfinite(one.max - one.min):
             if not math.isfinite(high - low):
                 raise InputError(
                     f"{measurement.name}: '{name}' cannot vary, as the {drive} drive of this test "
                     "has nothing that would show it; leave it fixed"
                 )
-            wanted[name].set(min=low, max=high)
+            one.set(
+                min=one.min if math.isfinite(one.min) else low,
+                max=one.max if math.isfinite(one.max) else high,
+            )
 
     _counted_from(wanted, measurement.origins, -1.0)
-    _check_held(wanted)
-    _check_strain(wanted, measurement)
+    check_admissible(wanted, usual)
+    check_strain(wanted, measurement)
     for name in (one.name for one in objective.given):
         if not wanted[name].vary:
             why = f"follows from {wanted[name].expr}" if wanted[name].expr else "is held fixed"
