@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import foamfit as ff
 from conftest import EXPERIMENTS, needs_panel
 from cycled import write_record
 from serving import served
@@ -370,6 +371,23 @@ def test_a_raw_file_is_drawn_and_offers_its_columns(chromium, served, tmp_path):
         for width in (390, 1280):
             page.set_viewport_size({"width": width, "height": 800})
             page.wait_for_function(f"document.documentElement.scrollWidth <= {width}")
+
+
+def test_ticked_tests_of_a_joint_report_are_compared(chromium, tmp_path):
+    """Its table of tests is not the first of the report."""
+    for stiff, name in enumerate("ab", start=1):
+        table = "\n".join([HEAD, *(f"{i},{stiff * i},{0.1 * i}" for i in range(30))])
+        (tmp_path / f"{name}.csv").write_text(table)
+        (tmp_path / f"{name}.toml").write_text('specimen = {height = "10 mm", diameter = "8 mm"}')
+    study = tmp_path / "two.toml"
+    study.write_text('tests = ["*.csv"]\nmodel = "linear"\ndrive = "displacement"\n')
+    ff.joint(study).save(tmp_path / "joint")
+    page = chromium.new_page()
+    page.goto((tmp_path / "joint" / "joint.html").as_uri())
+    for box in page.locator("input[type=checkbox]").all():
+        box.check()
+    line = f'foamfit compare "{tmp_path}/joint/a" "{tmp_path}/joint/b"'
+    api.expect(page.locator("#line")).to_have_text(line)
 
 
 def test_the_page_says_that_its_program_has_ended(chromium, served):

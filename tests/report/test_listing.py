@@ -55,6 +55,17 @@ def test_the_page_links_to_the_reports_and_draws_the_loops(folder):
     assert page.count('type="checkbox"') == 3
 
 
+def test_only_results_that_compare_takes_can_be_ticked(folder):
+    whole = {"schema": 1, "foamfit": "0", "name": "family", "model": "bistable", "relaxation": 0}
+    whole |= {"status": "ok", "parameters": {}, "tests": {}}
+    (folder / "family").mkdir()
+    (folder / "family/joint.json").write_text(json.dumps(whole))
+    page = write_index(folder, results_in(folder)).read_text(encoding="utf-8")
+    boxes = dict(re.findall(r'type="checkbox" value="(.*?)" aria-label=".*?"( disabled)?>', page))
+    assert [at for at, off in boxes.items() if not off] == ["model-1/impact", "model-3/stress"]
+    assert boxes["family"]
+
+
 def test_the_page_is_written_again_and_no_other_page_is_replaced(folder):
     found = results_in(folder)
     path = write_index(folder, found)

@@ -75,6 +75,11 @@ class Row:
         return next((name for name in names if (self.place / name).is_file()), "")
 
     @property
+    def comparable(self) -> bool:
+        """Whether `foamfit compare` takes it: a fit, and not a joint fit."""
+        return not self.error and (self.place / "fit.json").is_file()
+
+    @property
     def counts(self) -> tuple[int, int]:
         """How many parameters of the springs are determined, and how many have a state."""
         return tables.count_determined(self.parameters)
