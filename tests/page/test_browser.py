@@ -212,9 +212,13 @@ def test_load_drop_fit_stop_turn_and_save(window, tmp_path):
     page.get_by_role("button", name="Fit", exact=True).click()
     api.expect(page.get_by_text("best misfit").first).to_be_visible(timeout=LATER)
     api.expect(height).to_be_disabled()
+    choose(page, ("other.csv", rows()))  # is refused until the fit has ended
+    refused = page.get_by_text("A fit is running; stop it")
+    api.expect(refused).to_be_visible()
     page.get_by_role("button", name="Stop").click()
     report = page.frame_locator("iframe")
     api.expect(report.get_by_text("stopped by Ctrl-C").first).to_be_visible(timeout=LATER)
+    api.expect(refused).to_have_count(0)
     # A complete fit with a fixed parameter.
     page.get_by_label("s1_eta as a number").fill("3")
     page.get_by_label("s1_eta fixed in the fit").check()

@@ -333,6 +333,7 @@ class Window:
     def _ended(self) -> None:
         """Show the result of the fit, or why it failed."""
         self._hold(False)
+        self.received.object = ui.soft(self.desk.given)  # a file may have been refused meanwhile
         self.progress.object = ui.piece("ended")
         if (result := self.desk.result) is None:
             self.ending.object = ui.wrong(self.desk.ending())
