@@ -65,6 +65,14 @@ def test_packed_tables_and_workbooks_are_tests(here):
     assert not {"~$e.xlsx", "f.tar.gz", "specimens.csv.gz"} & found
 
 
+def test_a_packed_table_has_the_name_of_its_toml_and_none_that_of_a_summary(here):
+    for name in ("d.csv.gz", "summary.html.csv", "summary.csv.gz"):
+        (here / "monday" / name).write_bytes(b"x")
+    assert names("monday") == ["a", "b", "d", "summary", "summary.html-2"]
+    (here / "monday/d.csv").write_text("x")
+    assert names("monday")[2:4] == ["d-csv", "d-csv-gz"]
+
+
 def test_a_missing_file_or_a_broken_link_is_left_to_its_reader(here):
     assert names("monday/none.csv", "monday/a.csv") == ["a", "none"]
     with pytest.raises(InputError, match=r"monday/none\.csv: no such file or folder"):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from foamfit.data import toml_file
-from foamfit.data.toml_file import Check, Rule, checked, motion_file, table_of
+from foamfit.data.toml_file import Check, Rule, checked, motion_file, table_of, toml_beside
 from foamfit.errors import InputError, naming
 from foamfit.options import FREED, KINDS, OF_FIT
 from foamfit.report.folder import FILES
@@ -212,10 +212,11 @@ def _is_test(path: Path) -> bool:
 def _names(paths: list[Path]) -> Iterator[str]:
     """Name each file by its stem and as many parent folders as make the name unique."""
     files = [_real(path) for path in paths]
-    same = Counter((file.parent, file.stem.casefold()) for file in files)
+    tomls = [toml_beside(file) for file in files]  # that of a.csv.gz is a.toml
+    same = Counter(str(toml).casefold() for toml in tomls)
     stems = [
-        file.stem if same[file.parent, file.stem.casefold()] == 1 else file.name.replace(".", "-")
-        for file in files
+        toml.stem if same[str(toml).casefold()] == 1 else file.name.replace(".", "-")
+        for toml, file in zip(tomls, files, strict=True)
     ]
     names = list(stems)
     for depth in range(1, max(len(file.parts) for file in files)):
@@ -223,7 +224,7 @@ def _names(paths: list[Path]) -> Iterator[str]:
         for i, file in enumerate(files):
             if counts[names[i].casefold()] > 1:
                 names[i] = "-".join([*file.parent.parts[1:][-depth:], stems[i]])
-    taken = set[str]()
+    taken = {own for written in FILES.values() for own in written}
     for name in names:
         unique, count = name, 1
         while unique.casefold() in taken:  # "a-b.csv" and "a/b.csv"
