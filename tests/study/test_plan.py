@@ -390,6 +390,10 @@ def test_what_cannot_be_planned_is_refused(soft, tmp_path):
         ff.plan()
     with pytest.raises(InputError, match="peak_force"):
         ff.plan(soft, quantity="mass at 3 m/s")
+    with pytest.raises(InputError, match="'peak_force at -3 m/s' needs a positive velocity"):
+        ff.plan(soft, quantity="peak_force at -3 m/s")
+    with pytest.raises(InputError, match="two results are of this record"):  # of any drive
+        ff.plan(soft, ff.fit(soft.measurement, drive="stress", starts=1))
     run_refused("plan", tmp_path / "missing")
 
 

@@ -401,9 +401,11 @@ class Target:
                 '"peak_force at 3 m/s"'
             )
         velocity = parse_quantity(speed, "m/s", f"quantity {text!r}", "peak_force at 3 m/s")
+        if velocity <= 0.0:
+            raise InputError(f"quantity {text!r} needs a positive velocity, like {name} at 3 m/s")
         striker = known.problem.measurement.striker
         mass = (striker and striker.mass) or (rig.masses[0] if rig.masses else None)
-        if mass is None or velocity <= 0.0:
+        if mass is None:
             raise InputError(f"quantity {text!r} needs a striker; give its mass in the rig")
         asked = as_test(known, Candidate("impact", mass, velocity), rig, with_motion=True)
         found = [cls._in_draw(name, known, asked, drawn.springs) for drawn in known.draws]

@@ -183,8 +183,20 @@ def _read(results: Sequence[object]) -> tuple[list[Test], dict[str, Test]]:
         raise InputError("name at least one result to plan from")
     first = found[0].problem.model
     same = [one for one in found if one.problem.model == first]
+    _check_records([one.problem.measurement for one in same])
     rest = [one for one in found if one.problem.model != first]
     return same, {law_in_words(x.problem.model.name, x.problem.model.relaxation): x for x in rest}
+
+
+def _check_records(tests: Sequence[Measurement]) -> None:
+    """Raise InputError if two results are of one record, whose samples would count twice."""
+    for one, other in combinations(tests, 2):
+        first = max(one.cycle, other.cycle)
+        last = min(each.last_cycle or each.cycle for each in (one, other))
+        if one.data_sha256 and one.data_sha256 == other.data_sha256 and first <= last:
+            raise InputError(
+                f"{one.name}: two results are of this record, which counts once; leave one out"
+            )
 
 
 def _published(name: str) -> Test:
