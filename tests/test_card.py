@@ -361,6 +361,7 @@ def test_the_command_writes_card_numbers_and_picture(fit: Path) -> None:
         (["--format", "mat083", "--units", "inch"], "units = 'inch' is unknown"),
         (["--format", "mat083", "--rates", "1,-2"], "rates = 1,-2 must be positive"),
         (["--format", "csv", "--out", "no/such/card.csv"], "there is no folder"),
+        (["--format", "csv", "--out", "."], ". is a folder; name a file"),
         ([], "--format"),
     ],
 )

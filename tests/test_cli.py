@@ -386,6 +386,7 @@ def test_refuses_calls_of_fit(here: Path, args: list[str], words: tuple[str, ...
         (["compare", "/dev/zero"], ("/dev/zero", "device")),
         (["batch", "NOTHING"], ("NOTHING", "no such file", ".csv")),
         (["simulate", "none.toml"], ("none.toml", "no such file")),
+        (["simulate", "."], ("directory", "scene")),
         (["compare", "none"], ("none is not a result folder",)),
     ],
 )

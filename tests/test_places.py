@@ -98,6 +98,10 @@ def test_what_is_made_of_a_result_is_named_after_its_place() -> None:
     assert _named("fits/foam/bistable", cycle=2, drive=None) == "foam-bistable-cycle-2"
     assert _named("runs/foam", "foam-1/model-2", rig="slow") == "runs-foam+foam-1-model-2-rig-slow"
     Path("fits").touch()
+    Path("plans/foam").mkdir(parents=True)
+    Path("plans/foam/joint.toml").write_text(
+        'tests = ["../../foam.csv", "b.csv"]\nmodel = "linear"\n'
+    )
     assert "fits/foam-joint cannot" in run_refused("joint", "plans/foam/joint.toml")
 
 

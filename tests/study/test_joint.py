@@ -286,6 +286,8 @@ def test_the_command_writes_and_prints(folder, tmp_path, monkeypatch):
     (tmp_path / "out" / "t1" / "mine.txt").write_text("mine")
     kept = run_refused("joint", study, "--out", tmp_path / "out")
     assert "holds t1, which foamfit did not write" in kept
+    told = run_refused("joint", folder / "t0.csv", "--out", tmp_path / "out")
+    assert "t0.csv" in told  # that it is no study is said before what the folder holds
 
 
 @pytest.mark.parametrize(

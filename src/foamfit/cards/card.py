@@ -204,7 +204,7 @@ class Card:
         Raises InputError, before anything is written, if permissions forbid one of the files.
         """
         path = Path(path)
-        files = [path, *(path.with_name(f"{path.name}.{form}") for form in ("json", "png", "pdf"))]
+        files = [path, *(Path(f"{path}.{form}") for form in ("json", "png", "pdf"))]
         for one in files:
             check_file(one)
         _check_own(path, files[1])

@@ -293,11 +293,11 @@ def joint(study: Path, seed: int | None, output: Output) -> int:
         s1_eps_star = 0.3                       # fixed at a value (SI)
     Also: seed, cycle, starts, and [specimens] with a TOML for single tests: heel-1 = "a.toml".
     """
-    name = f"{study.resolve().parent.name}-joint" if study.stem == "joint" else study.stem
-    folder = output.folder(Path("fits", name), "joint.json")
     from foamfit.study.study_file import read_study
 
-    read = read_study(study)
+    read = read_study(study)  # report a wrong path before the folder that it would have
+    name = f"{study.resolve().parent.name}-joint" if study.stem == "joint" else study.stem
+    folder = output.folder(Path("fits", name), "joint.json")
     from foamfit.study.joint import joint as fit_jointly
 
     options.compile_solver(output.silent, read.model)

@@ -125,7 +125,7 @@ def simulate(
     from foamfit.scene_file import check_target, read_scene, write_response
     from foamfit.solve.simulation import simulate as run
 
-    target = Path(scene.with_suffix(".csv").name) if out is None else out
+    target = Path(f"{scene.stem}.csv") if out is None else out
     options.check_plot(plot)
     check_file(target)
     check_target(target)  # the scene and its drive are kept, as every file of others
