@@ -80,7 +80,11 @@ def test_a_law_of_a_file_is_fitted_and_predicts(
         assert found[name]["state"] == "determined"
         assert found[name]["value"] == pytest.approx(true, rel=0.02)
     monkeypatch.setattr(laws, "_LAWS", {k: v for k, v in laws._LAWS.items() if k != "cubic"})
-    assert "'cubic' is not a spring" in run_refused("predict", "r", "t2.csv")
+    for wrong in (("predict", "r", "t2.csv"), ("plan", "r"), ("compare", "r", "r")):
+        told = run_refused(*wrong)
+        assert "'cubic' is not a spring" in told
+        assert "--law FILE.py" in told  # and not: fit again
+        assert not {"again", "wrote"} & {*told.split()}
     told = run("predict", "r", "t2.csv", "--law", cubic, "--json", "--no-report")
     assert json.loads(told.stdout)["misfit"]["stress_strain"] < 0.01
 

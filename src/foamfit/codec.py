@@ -17,7 +17,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.errors import InputError
+from foamfit.errors import InputError, UnknownLawError
 from foamfit.springs.spring import Spring
 
 Columns = Mapping[str, Array]
@@ -31,6 +31,8 @@ def reading(what: str) -> Iterator[None]:
     """Turn errors of reading a result in the body into an InputError of one sentence."""
     try:
         yield
+    except UnknownLawError as error:
+        raise InputError(f"{what} cannot be read here: {error}") from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:  # InputError among them
         fault = "a value is of the wrong kind"
         if isinstance(error, InputError | KeyError):

@@ -19,6 +19,10 @@ class InputError(ValueError):
         self.lines = lines
 
 
+class UnknownLawError(InputError):
+    """A law is not known in this process, so a result of it may be whole."""
+
+
 def check_whole(name: str, value: object, least: int) -> None:
     """Raise InputError unless an argument is a whole number from `least` up."""
     if not isinstance(value, Integral) or isinstance(value, bool) or int(value) < least:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from foamfit.arrays import Array
-from foamfit.errors import InputError
+from foamfit.errors import InputError, UnknownLawError
 from foamfit.options import FREED, MOST_TERMS
 from foamfit.springs import laws
 from foamfit.springs.chain import Chain
@@ -67,9 +67,9 @@ class Model:
         known = [law.kind for law in laws.records()]
         for kind in kinds:
             if kind not in known:
-                raise InputError(
-                    f"model '{name}': '{kind}' is not a spring; "
-                    f"join {', '.join(laws.kinds())} by '+', from the base up"
+                raise UnknownLawError(
+                    f"model '{name}': '{kind}' is not a spring; join {', '.join(laws.kinds())} by "
+                    f"'+', from the base up, {laws.OR_OWN}"
                 )
         if relaxation and not any(laws.law(kind).hysteretic for kind in kinds):
             raise InputError(

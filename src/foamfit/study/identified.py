@@ -15,7 +15,7 @@ import numpy as np
 
 from foamfit.arrays import Array
 from foamfit.codec import build
-from foamfit.errors import InputError
+from foamfit.errors import InputError, UnknownLawError
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.options import DRIVES, KINDS, RATES
 from foamfit.parts import ParameterEstimate
@@ -74,6 +74,8 @@ def read_source(result: Result | str | Path) -> Source:
         raise InputError(f"{where} is not the result of a fit or joint fit (fit.json, joint.json)")
     try:
         return _source(content, where)
+    except UnknownLawError as error:
+        raise InputError(f"{where} cannot be read here: {error}") from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:  # InputError among them
         why = f"has no {error}" if isinstance(error, KeyError) else f"cannot be read: {error}"
         raise InputError(f"{where} {why}; give the result as foamfit wrote it") from None

@@ -13,7 +13,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from foamfit.errors import InputError
+from foamfit.errors import InputError, UnknownLawError
 from foamfit.options import FREED
 from foamfit.springs.laws import bistable, linear, microscale
 from foamfit.springs.laws.bistable import BistableSpring as BistableSpring
@@ -22,6 +22,7 @@ from foamfit.springs.laws.microscale import MicroscaleSpring as MicroscaleSpring
 from foamfit.springs.laws.record import Functions as Functions, Law as Law, Param as Param
 
 ENTRY_POINTS = "foamfit.laws"
+OR_OWN = "or your own law, made known by --law FILE.py (foamfit.register)"
 _BUILT_IN = (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, *microscale.LAWS)
 _LAWS = {law.kind: law for law in _BUILT_IN}
 PAPER = tuple(_LAWS)  # built-in laws
@@ -34,7 +35,8 @@ def law(kind: str) -> Law:
     if kind not in _LAWS:
         _load_packages()
     if kind not in _LAWS:
-        raise InputError(f"'{kind}' is not a spring; it must be one of {', '.join(kinds())}")
+        why = f"'{kind}' is not a spring; it must be one of {', '.join(kinds())}, {OR_OWN}"
+        raise UnknownLawError(why)
     return _LAWS[kind]
 
 
