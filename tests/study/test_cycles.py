@@ -140,3 +140,14 @@ def test_two_cycles_of_a_shoe_foam(tmp_path):
     assert strains[1] == 0.0
     assert 0.01 < strains[4] < 0.03
     assert all(off < 0.0065 for off in found.by_cycle["misfit_stress_strain"])
+
+
+def test_words_are_no_numbers_of_cycles(tmp_path):
+    path = write_record(tmp_path)
+    for wrong in ("all", [1.5], [0]):
+        with pytest.raises(ff.InputError, match=r"cycles: a number = .* whole number from 1 up"):
+            ff.fit_cycles(path, cycles=wrong, model="linear")
+    for wrong in ("x", 1.5, [1, 0]):
+        with pytest.raises(ff.InputError, match=r"cycle = .* whole number from 1 up"):
+            ff.batch(path, cycle=wrong, model="linear", out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()

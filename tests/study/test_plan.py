@@ -386,6 +386,8 @@ def test_a_wrong_rig_is_refused_by_name(soft, tmp_path, text, message):
 def test_what_cannot_be_planned_is_refused(soft, tmp_path):
     with pytest.raises(InputError, match=r"no such file|not a folder"):
         ff.plan(tmp_path / "missing")
+    with pytest.raises(InputError, match="seed = -1 is not admissible"):
+        ff.plan(soft, seed=-1)
     with pytest.raises(InputError, match="at least one result"):
         ff.plan()
     with pytest.raises(InputError, match="peak_force"):

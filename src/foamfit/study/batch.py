@@ -220,6 +220,8 @@ def batch(
     """
     numbers = () if cycle == "all" else cycle
     if numbers is not None:
+        for number in numbers if np.iterable(numbers) else (numbers,):
+            check_whole("cycle", number, 1)
         numbers = tuple(map(int, numbers)) if np.iterable(numbers) else int(numbers)
     chosen = Options.of("batch", options)
     named = _checked(model, chosen)

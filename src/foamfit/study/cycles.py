@@ -11,7 +11,7 @@ from foamfit.api import fit
 from foamfit.arrays import single_threaded
 from foamfit.codec import plain
 from foamfit.data.csv_file import read_test
-from foamfit.errors import InputError, SimulationError
+from foamfit.errors import InputError, SimulationError, check_whole
 from foamfit.fitting.search import what_stopped
 from foamfit.one_model import Options, Progress, part_of
 from foamfit.options import Keywords
@@ -189,6 +189,8 @@ def fit_cycles(
     report = progress or (lambda *_: None)
     first = read_test(path, specimen)
     wanted = first.cycles if cycles is None else tuple(dict.fromkeys(cycles))
+    for number in wanted:
+        check_whole("cycles: a number", number, 1)
     if not wanted:
         raise InputError("no cycle is given; give at least one, or omit cycles to fit all")
     results, refused = dict[int, Fit](), dict[int, str]()

@@ -22,7 +22,7 @@ from foamfit.api import FitResult
 from foamfit.arrays import Array, single_threaded
 from foamfit.data.measurement import MEASURED, Measurement, Noise, Specimen, Striker
 from foamfit.data.rig import Candidate, Rig, beyond, candidates, read_rig
-from foamfit.errors import InputError, SimulationError
+from foamfit.errors import InputError, SimulationError, check_whole
 from foamfit.fitting.minimizer import problem_of
 from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import make_params, make_problem
@@ -89,6 +89,7 @@ def plan(
     InputError
         If a result or the rig cannot be read, or if the rig can make no test.
     """
+    check_whole("seed", seed, 0)
     tests, rivals = _read(results)
     rng, test = np.random.default_rng(seed), tests[0].problem.measurement
     # A hold is worth a try if one of the laws relaxes.
