@@ -10,7 +10,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from foamfit.springs.compiled.stale import drop_stale
+from foamfit.springs.compiled.contract import drop_stale, nothing
 
 LOG = logging.getLogger(__name__)
 
@@ -18,9 +18,8 @@ LOG = logging.getLogger(__name__)
 def _caches() -> set[Path]:
     """Return numba's cache folders of this package, one for each folder with compiled loops."""
     from foamfit.solve.compiled import loop
-    from foamfit.springs.compiled import bistable
 
-    loops: tuple[Any, ...] = (loop.integrate, bistable.fill)
+    loops: tuple[Any, ...] = (loop.integrate, nothing)
     return {Path(loop.stats.cache_path or ".") for loop in loops}
 
 
@@ -51,7 +50,7 @@ def compiling(what: str) -> str:
 def compiled(name: str = "integrate") -> bool:
     """Whether the cache contains a loop compiled from the current source.
 
-    Files of another source are removed before; see `springs.compiled.stale`.
+    Files of another source are removed before; see `drop_stale`.
     """
     for folder in (caches := _caches()):
         drop_stale(folder)

@@ -105,8 +105,8 @@ def _functions(
         ("motion", "compute_rates", True), ("groups", "group_values", several),
         ("internal", "inside_task", internal), ("events", "enter_branch", True),
         ("implicit" if shape.degree else "explicit", "step", integrated),
-        ("loop", "advance", integrated), ("drive", "next_piece", integrated and not shape.struck),
-        ("samples", "sample_task", integrated), ("decay", "fade", fades),
+        ("loop", "advance", integrated), ("loop", "next_piece", integrated and not shape.struck),
+        ("samples", "sample_task", integrated), ("internal", "fade", fades),
         ("series", "relaxing_step", relaxes),
     )  # fmt: skip
     return tuple(

@@ -295,7 +295,7 @@ class Plan:
     ) -> Motion | None:
         """Solve springs in static equilibrium under one stress, or one spring in known motion.
 
-        Return None if internal variables do not decay as `compiled.decay` requires.
+        Return None if internal variables do not decay as `compiled.internal` requires.
         """
         count, n = len(heights), self.time.size
         alone = self.top == scenes.MOTION and count == 1

@@ -268,6 +268,6 @@ def law_of(count: int) -> tuple[Law, contract.Compiled]:
     """Return the law of an aggregate of so many springs."""
     columns = SPRINGS + count * OF_SPRING + 4 * _leaves(count) + 5 * MOST_SWITCHES * count
     # Explicit steps integrate its stress, so that `settle` and `strain` are not called.
-    functions = _begin, _evaluate, _switch, bistable.settle, bistable.strain
+    functions = _begin, _evaluate, _switch, contract.settle, bistable.strain
     made = contract.Compiled(None, contract.BY_STRESS, columns, 0, 1, functions)
     return Law("aggregate", (), made), made

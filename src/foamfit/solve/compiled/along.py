@@ -21,7 +21,7 @@ from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATI
 OF_STEP, TABLE = 6, 8  # columns of the table of a relaxation term, which begins with moments
 LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the middle adds
 LEAST_FADE = 1e-6  # least step with internal variables that decay
-SAME, TOO_LONG, UNFIT = range(3)  # ends of a step of `decay`; UNFIT if the law needs another solver
+SAME, TOO_LONG, UNFIT = range(3)  # ends of a step of `fade`; UNFIT if the law needs another solver
 
 
 @inner
@@ -142,7 +142,7 @@ def step_to(c, part, h, m, seed, tol, weight):
     """Step to a strain of the branch within h; false, unchanged, if the step is too long.
 
     m: largest stress, share of the interval (negative if the law needs another solver), tables,
-    derivatives at the start, results of `decay` or derivatives in the middle.
+    derivatives at the start, results of `fade` or derivatives in the middle.
     """
     s, p = c.springs, c.p
     tables, d_first = past(m, 2), past(m, 2 + c.terms * TABLE)

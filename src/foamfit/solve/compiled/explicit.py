@@ -4,7 +4,7 @@ Switches of branch and the end of contact are roots on the dense output, of orde
 computed only in steps that contain a sample or, by a look at both ends, may contain a switch. The
 error norm leaves the derivatives by parameters out.
 
-A drive is linear between two samples, so no step is longer; see also `drive`.
+A drive is linear between two samples, so no step is longer; see also `loop`.
 """
 
 from __future__ import annotations

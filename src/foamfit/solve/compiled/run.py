@@ -31,7 +31,7 @@ from foamfit.springs.compiled.contract import REAL, REALS_AT, WHOLE, address, in
 # of its T at fixed strain; of the stress of each group, then zeros and two rows to work with; of
 # the strains; scales of the kinds of components; rates at the stages of a step; its dense output;
 # the state, that at the end of a step, and one between with its rates; zeros; errors; samples that
-# are computed together; what is set aside during a ramp, see `drive`. Those of implicit steps:
+# are computed together; what is set aside during a ramp, see `loop`. Those of implicit steps:
 # Jacobian, n rows of 2 reach + 1; vibrations, see `rates.remember`; values of the derivatives over
 # the scales; a copy of `springs` and `carried`; factored systems, complex, SYSTEMS of n rows of
 # 3 reach + 1, and their right sides.

@@ -25,7 +25,7 @@ from numba import njit
 from foamfit.springs.compiled import contract, mixture as mix
 from foamfit.springs.compiled.contract import BY, BY_HELD, MISS, OF_LAW, SLOPE, inner, past, start
 from foamfit.springs.compiled.mixture import AGAIN, BACK, BOTH, FIXED, SNAP, A, at_stress, shares
-from foamfit.springs.law import most_beyond
+from foamfit.springs.laws.microscale import most_beyond
 
 _most_beyond = inner(most_beyond)
 

@@ -21,7 +21,6 @@ from numba.extending import intrinsic
 
 from foamfit.arrays import Array
 from foamfit.springs.compiled import contract
-from foamfit.springs.compiled.bistable import settle
 from foamfit.springs.compiled.contract import BY, EXPLICIT, INTERNAL, SLOPE, inner, past
 
 if TYPE_CHECKING:
@@ -378,7 +377,7 @@ def compile_law(law: Law) -> contract.Compiled:
         contract.call_begin(begin_any, row, s)
         return 0.0
 
-    functions = (begin, _evaluate, _switch, settle, _strain)
+    functions = (begin, _evaluate, _switch, contract.settle, _strain)
     addresses = tuple(one.address for one in functions)
     kept.append((formulas, begin))  # the addresses stay valid
     # parameters, slope at rest, then room for complex numbers

@@ -12,17 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foamfit.arrays import Array
-from foamfit.springs.law import most_beyond
+from foamfit.springs.laws.bistable import K0, KC, steeper
 from foamfit.springs.laws.record import LAST_STRAIN, Between, Law, Param
-from foamfit.springs.laws.shared import K0, KC, steeper
 from foamfit.springs.loop import Loop
-from foamfit.springs.spring import (
-    Relaxation,
-    Spring,
-    as_samples,
-    freeze,
-    require,
-)
+from foamfit.springs.spring import Relaxation, Spring, as_samples, freeze, require
 
 
 @dataclass(frozen=True)
@@ -152,6 +145,47 @@ class MicroscaleSpring(Spring):
             ("+", "through", self.sigma_plus, self.spread_plus),
             ("−", "back", self.sigma_minus, self.spread_minus),
         )
+
+
+def most_beyond(k: float, kc: float, n: float) -> tuple[float, float]:
+    """Return the least ε_* with which branch c never lies before branch a, and its stress.
+
+    It is the maximum over σ of the difference
+    f(σ) = a(σ; k) - σ/(kc+σ) with a = 1 - (1 + nσ/k)^(-1/n). It rises where
+    g(σ) = 2 ln(kc+σ) - ln(k kc) - (1+1/n) ln(1+nσ/k) is positive; g turns once at most, so f has
+    one maximum at most.
+    """
+    if n == 1.0:
+        one, other = math.sqrt(k), math.sqrt(kc)
+        return max(0.0, (other - one) / (other + one)), one * other
+
+    def rises(sigma: float) -> float:
+        gains = 2.0 * math.log(kc + sigma) - math.log(k) - math.log(kc)
+        return gains - (1.0 + 1.0 / n) * math.log1p(n * sigma / k)
+
+    turn = ((1.0 + n) * kc - 2.0 * k) / (n - 1.0)  # of g
+    if n > 1.0:  # g falls up to its turn, and is negative there
+        if kc <= k:
+            return 0.0, 0.0
+        low, high = 0.0, turn
+    else:  # g rises up to its turn, if that is at a stress at all, and falls without end
+        low = max(turn, 0.0)
+        if rises(low) <= 0.0:
+            return 0.0, 0.0
+        high = max(low, k, kc)
+        while rises(high) > 0.0 and high < 1e300:
+            high *= 2.0
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        if not low < middle < high:
+            break
+        if rises(middle) > 0.0:
+            low = middle
+        else:
+            high = middle
+    sigma = 0.5 * (low + high)
+    excess = -math.expm1(-math.log1p(n * sigma / k) / n) - sigma / (kc + sigma)
+    return max(excess, 0.0), sigma
 
 
 @lru_cache(maxsize=256)
