@@ -36,7 +36,7 @@ from foamfit.fitting.curves import (
 from foamfit.fitting.scenes import NOWHERE, Places, Scenes, channel_of
 from foamfit.fitting.starts import thinned
 from foamfit.fitting.weighing import Weighing
-from foamfit.solve.scene import Motion
+from foamfit.solve.plan import Motion
 from foamfit.springs.model import Model
 
 # Residual after a failed simulation, as a multiple of the measured range.

@@ -16,8 +16,7 @@ from foamfit.data.cycles import cycles_of, find_turns
 from foamfit.data.measurement import Measurement
 from foamfit.fitting.box import Space
 from foamfit.fitting.nuisance import TIME_SHIFT
-from foamfit.springs.laws.record import Law, Param
-from foamfit.springs.loop import Loop
+from foamfit.springs.laws.record import Law, Loop, Param
 from foamfit.springs.parameters import family, split_name
 
 LOOP_SAMPLES = 300

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.solve import cache
-from foamfit.solve.compiled import along, loop, static
-from foamfit.solve.compiled.run import ENDED, OUTCOME, SWITCHES
+from foamfit.solve.compiled import along, groups, loop
+from foamfit.solve.compiled.run import DONE, ENDED, MOTION, OUTCOME, STRESS, SWITCHES
 from foamfit.solve.layout import Shape, memory_of
-from foamfit.solve.scene import DONE, MOTION, NO_SWITCHES, STRESS
 from foamfit.springs.compiled import compiled
 from foamfit.springs.compiled.contract import FLOWS, INTERNAL
 from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, Law
 
+NO_SWITCHES = np.empty((0, 5))
 _ONE = np.ones(1)
 TOL = 1e-12  # of a law with internal variables
 
@@ -67,7 +67,7 @@ def strain_along(law: Law, row: Array, stress: Array) -> Array:
     given, integrated = _given(law, row, stress, STRESS, out)
     if not integrated:
         history = np.empty((2, 1, stress.size))
-        static.balance(*given, NO_SWITCHES, history)
+        groups.balance(*given, NO_SWITCHES, history)
         return np.asarray(history[0, 0])
     loop.integrate(*given, NO_SWITCHES)
     if given[1][OUTCOME] != DONE:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.solve import cache
 from foamfit.solve.compiled import run
-from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
+from foamfit.solve.compiled.run import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled import compiled, contract
 from foamfit.springs.compiled.contract import BY_STRESS, FADES, INTERNAL
 from foamfit.springs.laws.record import DRAG, OWN_ETA, OWN_HEIGHT, Law
@@ -107,7 +107,7 @@ def _functions(
         ("implicit" if shape.degree else "explicit", "step", integrated),
         ("loop", "advance", integrated), ("loop", "next_piece", integrated and not shape.struck),
         ("samples", "sample_task", integrated), ("internal", "fade", fades),
-        ("series", "relaxing_step", relaxes),
+        ("explicit", "relaxing_step", relaxes),
     )  # fmt: skip
     return tuple(
         getattr(import_module(f"foamfit.solve.compiled.{module}"), name).address if needed else 0

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve import plan as plans
-from foamfit.solve.plan import NO_DIRECTIONS, Directions, Motion, Plan, plan
-from foamfit.solve.scene import MOTION, Slopes, difference
+from foamfit.solve.compiled.run import MOTION
+from foamfit.solve.plan import NO_DIRECTIONS, Directions, Motion, Plan, Slopes, plan
 from foamfit.springs.chain import Chain, ChainArrays, Drive, check_scene
 from foamfit.springs.compiled.contract import BY_STRESS
 from foamfit.springs.laws.record import DRAG, OWN_HEIGHT, OWN_RELAXATION
@@ -141,10 +141,16 @@ def _agrees_with_longer_steps(
     return _miss(motion.displacement[:, part], motion.base_stress[part], rough) <= 0.3 * rtol
 
 
+def _difference(one: Array, other: Array) -> float:
+    """Return the largest difference of two curves over the range (0 included) of the first."""
+    span = max(float(one.max()), 0.0) - min(float(one.min()), 0.0)
+    return float(np.abs(one - other).max()) / span if span > 0.0 else 0.0
+
+
 def _miss(displacement: Array, base_stress: Array, other: Motion) -> float:
     """Return the largest difference of two runs over the ranges of the first."""
     return max(
-        difference(displacement, other.displacement), difference(base_stress, other.base_stress)
+        _difference(displacement, other.displacement), _difference(base_stress, other.base_stress)
     )
 
 
@@ -335,7 +341,7 @@ def simulate(
     scene = plan(chain, drive, t, dashpots=dashpots, relaxing=relaxing)
     motion = _verified(scene, chain.arrays, rtol, directions)
     if scene.top == MOTION and len(chain.springs) > 1:
-        miss = difference(scene.values, motion.displacement[-1])
+        miss = _difference(scene.values, motion.displacement[-1])
         if not miss <= max(rtol, ROUNDING):
             raise SimulationError(
                 f"the springs' elongations miss the prescribed displacement by {miss:.1g} of its "

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import math
 
+from foamfit.solve.compiled import run
 from foamfit.solve.compiled.motion import PART, evaluate
 from foamfit.solve.compiled.run import begin_run, call_fade, call_inside, change_branch
 from foamfit.solve.compiled.samples import is_finite, row_of
-from foamfit.solve.scene import DONE, NOT_FINITE
 from foamfit.springs.compiled.contract import call_number, inner, outer, past, start
 from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
@@ -262,5 +262,5 @@ def follow(ints, floats, rows, heights, mass, reals, strains, time, out, log, sa
         if not m[0] < math.inf:
             for k in range(j, n):
                 out[0, 0, k], samples[k, 2] = math.inf, s.branch
-            return UNFIT if m[1] < 0.0 else NOT_FINITE + c.none
-    return (DONE if is_finite(c, 1) else NOT_FINITE) + c.none
+            return UNFIT if m[1] < 0.0 else run.NOT_FINITE + c.none
+    return (run.DONE if is_finite(c, 1) else run.NOT_FINITE) + c.none

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import math
 
-from foamfit.solve import scene
 from foamfit.solve.compiled import events, run
 from foamfit.solve.compiled.motion import dense, in_contact, look, rates
-from foamfit.solve.compiled.run import change_branch, numbers, spring, sum_gain, write
+from foamfit.solve.compiled.run import MOTION, STRESS, change_branch, numbers, spring, write
 from foamfit.solve.compiled.samples import APPROACH, FLIGHT, INSIDE, KNOWN, is_finite, row_of
-from foamfit.solve.scene import MOTION, STRESS
 from foamfit.springs.compiled.contract import inner, outer, past, start
 from foamfit.springs.laws.record import BEGUN, STRUCK
 
@@ -286,7 +284,7 @@ def _end_ramp(c, want):
             y[n.z_at + k] = -s.sigma
             for j in range(p):
                 y[c.base + (n.z_at + k) * p + j] = -(s.steep * strain[j] + part[j])
-        sum_gain(c, i)
+        run.sum_gain(c, i)
         if aside[i] == 0.0:
             continue
         s.eta = aside[i]
@@ -386,12 +384,12 @@ def advance(c, how, struck, want):
 def _failure(c, how, most):
     """Return how a run ends after a step: DONE if it goes on."""
     if c.drive.flat > 0.0:
-        return c.none + scene.FLAT_UNDER_STRESS
+        return c.none + run.FLAT_UNDER_STRESS
     if how == events.FAILED and not abs(c.new[0]) < math.inf:
-        return c.none + scene.NOT_FINITE
+        return c.none + run.NOT_FINITE
     if c.now.taken >= most:
-        return c.none + scene.TOO_MANY_STEPS
-    return c.none + (scene.STEP_UNDERFLOW if how == events.FAILED else scene.DONE)
+        return c.none + run.TOO_MANY_STEPS
+    return c.none + (run.STEP_UNDERFLOW if how == events.FAILED else run.DONE)
 
 
 @outer
@@ -414,7 +412,7 @@ def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log):
     else:
         done = run.call_drive(c, 1, want)
         r.step = r.horizon
-    outcome, ended = scene.DONE, math.nan
+    outcome, ended = run.DONE, math.nan
     while not (done or (struck and int(r.sample) == c.samples)):
         _fresh_scales(c)
         events.keep_values(c)
@@ -422,11 +420,11 @@ def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log):
         upto = c.time[int(r.sample)] if struck else math.inf
         how = run.call_step(c, want, tol, upto, most)
         outcome = _failure(c, how, most)
-        event = run.call_advance(c, how, struck, want) if outcome == scene.DONE else c.none
+        event = run.call_advance(c, how, struck, want) if outcome == run.DONE else c.none
         stalled = stalled + 1 if event == STALLED else 0
         if stalled > 4 * c.count + 8:
-            outcome = scene.STEP_UNDERFLOW
-        if outcome != scene.DONE or event == RELEASED:
+            outcome = run.STEP_UNDERFLOW
+        if outcome != run.DONE or event == RELEASED:
             ended = r.begun + r.now
             break
         dt = r.step * r.grow

@@ -11,8 +11,7 @@ from __future__ import annotations
 import math
 
 from foamfit.solve.compiled import run
-from foamfit.solve.compiled.run import call_inside, numbers, spring
-from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
+from foamfit.solve.compiled.run import FREE, MOTION, STRESS, VISCOUS, call_inside, numbers, spring
 from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import inlined, inner, past
 from foamfit.springs.laws.record import HEAVIER, MOVED, OWN_ETA, OWN_RELAXATION

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from foamfit.solve.compiled.run import spring
-from foamfit.solve.scene import FREE, STRESS, VISCOUS
+from foamfit.solve.compiled.run import FREE, STRESS, VISCOUS, spring
 from foamfit.springs.compiled.contract import inner
 
 # Ratio of the rates of stopping and of creep above which dashpots stop a striker long before the

@@ -9,8 +9,7 @@ from __future__ import annotations
 import math
 
 from foamfit.solve.compiled.motion import dense, rates_of
-from foamfit.solve.compiled.run import BATCH, numbers, sampling, spring
-from foamfit.solve.scene import FREE, MOTION
+from foamfit.solve.compiled.run import BATCH, FREE, MOTION, numbers, sampling, spring
 from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import inlined, inner, outer, past, start
 from foamfit.springs.laws.record import BEGUN, OWN_ETA, OWN_RELAXATION, STRUCK

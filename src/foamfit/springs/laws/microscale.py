@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from foamfit.arrays import Array
 from foamfit.springs.laws.bistable import K0, KC, steeper
-from foamfit.springs.laws.record import LAST_STRAIN, Between, Law, Param
-from foamfit.springs.loop import Loop
+from foamfit.springs.laws.record import LAST_STRAIN, Between, Law, Loop, Param
 from foamfit.springs.spring import Relaxation, Spring, as_samples, freeze, require
 
 
