@@ -36,22 +36,16 @@ def warn(what: str) -> None:
     LOG.warning("foamfit: %s", compiling(what))
 
 
-@functools.cache
-def _first() -> str:
-    return ", once after installation"
+_ONCE = iter([", once after installation"])  # of the first message only
 
 
 def compiling(what: str) -> str:
     """Return the message that `what` is compiled; the first says that this happens only once."""
-    once = "" if _first.cache_info().currsize else _first()
-    return f"compiling {what}{once}"
+    return f"compiling {what}{next(_ONCE, '')}"
 
 
 def compiled(name: str = "integrate") -> bool:
-    """Whether the cache contains a loop compiled from the current source.
-
-    Files of another source are removed before; see `drop_stale`.
-    """
+    """Whether the cache contains a loop compiled from the current source, after `drop_stale`."""
     for folder in (caches := _caches()):
         drop_stale(folder)
     return any(True for folder in caches for _ in folder.glob(f"*.{name}-*.nbc"))

@@ -23,10 +23,7 @@ TOL = 1e-12  # of a law with internal variables
 
 
 def _given(law: Law, row: Array, history: Array, top: int, out: Array) -> tuple[list[Any], bool]:
-    """Return the arguments that all runs have in common, and whether they integrate in time.
-
-    Time is the number of the sample; it stands still for the law.
-    """
+    """Return the arguments that all runs have in common, and whether they integrate in time."""
     row, made = row.copy(), compiled(law)
     integrated = made.kind == INTERNAL and (made.flows == FLOWS or top == STRESS)
     row[0] = 0.0  # no dashpot
@@ -36,6 +33,7 @@ def _given(law: Law, row: Array, history: Array, top: int, out: Array) -> tuple[
     if top == STRESS:
         scales = 1e-3, 0.0, 1e-3, most
     reals = np.array((0.0, 0.0, 0.0 if integrated else TOL, TOL, 1e9, 0.0, 0.0, *scales))
+    # The number of the sample; time stands still for the law.
     time = np.arange(history.size, dtype=float)
     return [*memory, row[None, :], _ONE, _ONE, reals, history, time, out], integrated
 
@@ -45,7 +43,7 @@ def stress_along(law: Law, row: Array, strain: Array) -> tuple[Array, NDArray[np
 
     `row` is that of a spring of the law, without relaxation.
     """
-    out, samples = np.empty((1, 2, strain.size)), np.zeros((strain.size, 4))
+    out, samples = np.empty((1, 2, strain.size)), np.empty((strain.size, 4))
     given, integrated = _given(law, row, strain, MOTION, out)
     cache.announce(along.follow, "the laws of springs")
     if not integrated:
@@ -79,7 +77,7 @@ def slope_along(law: Law, row: Array, strain: Array) -> Array:
     """Return slopes dσ/dε (Pa) along a strain history, (n,), each on the branch of its sample."""
     given, integrated = _given(law, row, strain, MOTION, np.empty((1, 2, strain.size)))
     if not integrated:
-        samples = np.zeros((strain.size, 4))
+        samples = np.empty((strain.size, 4))
         along.follow(*given, NO_SWITCHES, samples)
         return samples[:, 3]
     # Differences over the last thousandth of the way to each sample; a sample without a way has the
@@ -97,28 +95,13 @@ def slope_along(law: Law, row: Array, strain: Array) -> Array:
 # ---------------------------------------------------------------- scenes in closed form
 
 
-def at_samples(strain: Array, moved: bool) -> Array:
-    """Return what `along.follow` is given and fills at each sample of a motion, (n, 4).
-
-    The first two columns are the derivative by a shift of the motion in contact, if it is asked for
-    (`moved`): their product with (1, ε).
-    """
-    out = np.zeros((strain.size, 4))
-    if moved:
-        contact = (strain != 0.0).astype(float)
-        out[:, 0] = contact
-        for j in np.flatnonzero(np.diff(contact)) + 1:  # contact begins or ends before this sample
-            out[j, :2] = 0.0, 1.0 / (strain[j] - strain[j - 1]) * (contact[j] - contact[j - 1])
-    return out
-
-
 def add_dashpot(
     out: Array, time: Array, strain: Array, eta: float, height: float, own: list[int],
     samples: Array,
 ) -> None:  # fmt: skip
     """Add the stress of the dashpot of one spring along its motion, and its derivatives.
 
-    `own` are the second numbers of their directions; for `samples` see `at_samples`.
+    `own` are the second numbers of their directions; for `samples` see `along.follow`.
     """
     if time.size == 1 or not (eta > 0.0 or OWN_ETA in own):
         return

@@ -20,7 +20,7 @@ from foamfit.solve.layout import Memory, Shape, memory_of
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled, slopes_of
 from foamfit.springs.compiled.contract import FLOWS, INTERNAL, Compiled
-from foamfit.springs.laws.record import MOVED, OWN_RELAXATION, Law
+from foamfit.springs.laws.record import OWN_RELAXATION, Law
 from foamfit.springs.spring import as_samples
 
 Directions = NDArray[np.int64]
@@ -123,10 +123,7 @@ def _numbers(
 
 @dataclass(eq=False)  # a run reads it thirty times; a named tuple takes twice as long
 class Plan:
-    """A scene prepared to run many times with different springs.
-
-    Above each group of springs lies a node with a mass, or the top.
-    """
+    """A scene for many runs with other springs; above each group lies a mass, or the top."""
 
     solver: str  #: the simplest that suffices
     laws: Laws
@@ -237,16 +234,14 @@ class Plan:
         return self._motion(out, method, told, log, rows, reals.item(loop.TOL))
 
     def _methods(self, rows: Array, heights: Array, drag: float, damped: bytes) -> tuple[int, ...]:
-        """Return the degrees of the methods to try: 0 for explicit steps.
-
-        Where explicit steps may take as many as all, implicit ones are not tried after them.
-        """
+        """Return the degrees of the methods to try: 0 for explicit steps."""
         if self.implicit is not None or self.time.size == 1:
             return (run.POINTS,) if self.implicit and self.time.size > 1 else (0,)
         if drag or len(self.ends) > 1 or 1 in damped:
             vibrates, relaxes = self.fastest_rates(rows, heights, drag)
             if vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION:
                 return run.POINTS, 0
+        # Where explicit steps may take as many as all, implicit ones are not tried after them.
         return (0, run.POINTS) if self.max_explicit < self.max_steps else (0,)
 
     def _reals(
@@ -278,10 +273,7 @@ class Plan:
         self, rows: Array, heights: Array, damped: bytes, directions: Directions, out: Array,
         log: Array, reals: Array, degree: int = 0,
     ) -> Memory:  # fmt: skip
-        """Run the loop over time, with implicit steps if `degree` is that of their polynomial.
-
-        Return the memory as the run has left it.
-        """
+        """Run the loop over time, with implicit steps if `degree` is not 0; return the memory."""
         memory = self._memory(rows, damped, directions, degree)
         drive = self.mass, reals, self.values, self.time
         cache.timed(loop.integrate, *memory, rows, heights, *drive, out, log)
@@ -346,10 +338,7 @@ class Plan:
     def _closed_form(
         self, rows: Array, heights: Array, rtol: float, everything: bool, directions: Directions
     ) -> Motion | None:
-        """Solve springs in static equilibrium under one stress, or one spring in known motion.
-
-        Return None if internal variables do not decay as `compiled.internal` requires.
-        """
+        """Solve equilibrium under one stress, or one spring in known motion; None if unfit."""
         count, n = len(heights), self.time.size
         alone = self.top == run.MOTION and count == 1
         shown = count if everything else 1
@@ -360,7 +349,7 @@ class Plan:
         given = *memory, rows, heights
         if alone:
             own, strain = directions[:, 1].tolist(), self.values / heights
-            samples = histories.at_samples(strain, MOVED in own)
+            samples = np.empty((n, 4))
             drive = self.mass, reals, strain, self.time
             outcome = cache.timed(along.follow, *given, *drive, out, NO_SWITCHES, samples)
             if outcome == along.UNFIT:

@@ -76,31 +76,30 @@ class Response:
 def _verified(
     scene: Plan, arrays: ChainArrays, rtol: float, directions: Directions = NO_DIRECTIONS
 ) -> Motion:
-    """Run a scene and, where its errors may grow, compare it with another run.
-
-    Raise SimulationError if the error exceeds `rtol`.
-    """
+    """Run a scene and, where errors may grow, compare it with another run, to within `rtol`."""
     rows, heights = arrays.rows, arrays.heights
+
+    def run(scene: Plan, rtol: float) -> Motion:
+        return scene.run(rows, heights, rtol, directions=directions)
+
     sharp = _may_snap_wrongly(scene)
     rtol = min(rtol, ROUGH) if sharp else rtol
     try:
-        motion = scene.run(rows, heights, rtol, directions=directions)
+        motion = run(scene, rtol)
     except SimulationError:
         if not sharp or rtol < 1e-8:
             raise
-        motion = scene.run(rows, heights, 1e-3 * rtol, directions=directions)
+        motion = run(scene, 1e-3 * rtol)
     groups = len(scene.ends)
     inside = groups > 2
     if groups == 2:  # the base stress depends on the velocity of the mass above
         viscous = any(one.viscous for one in scene.laws.made[: scene.ends[0]])
         inside = viscous or bool((rows[: scene.ends[0], 0] > 0.0).any())
     long = inside or motion.method == plans.RADAU or _is_long(scene, motion, FEW_STEPS)
-    if scene.speed > 0.0 and not long and not _hard(scene, arrays):
+    # An impact may bring a spring close to the end of its branch c if it has energy enough.
+    hard = 0.5 * scene.mass.item(-1) * scene.speed**2 >= 6.0 * arrays.steep
+    if scene.speed > 0.0 and not long and not hard:
         return motion
-
-    def run(scene: Plan, rtol: float) -> Motion:
-        return scene.run(rows, heights, rtol, directions=directions)
-
     lost = motion.unresolved
     if lost > 0.7 * rtol:  # the comparison below leaves 0.3
         # An explicit step covers about 3 radians and costs 1 % of an implicit step.
@@ -131,10 +130,7 @@ def _verified(
 def _agrees_with_longer_steps(
     scene: Plan, arrays: ChainArrays, motion: Motion, rtol: float
 ) -> bool:
-    """Whether longer steps give the same motion, so that errors do not grow.
-
-    Longer steps cost less than shorter ones.
-    """
+    """Whether longer steps, which cost less than shorter ones, give the same motion."""
     part = slice(None, None, THINNED if scene.speed > 0.0 else None)
     scene = scene.changed(time=scene.time[part].copy(), least=min(LONGER * motion.tol, LONGEST))
     rough = scene.run(arrays.rows, arrays.heights, rtol)
@@ -196,10 +192,7 @@ def _compared(
 
 
 def _may_snap_wrongly(scene: Plan) -> bool:
-    """Whether springs share one stress that decides which of them snaps, in steps of time.
-
-    In a snap of a narrow spread the smallest error of a strain may enter the wrong branch.
-    """
+    """Whether the smallest error may decide which of the springs under one stress snaps first."""
     if scene.solver != plans.FIRST_ORDER or len(scene.laws.made) == len(scene.ends):
         return False
     return any(one.kind == BY_STRESS for one in scene.laws.made)
@@ -231,11 +224,6 @@ def _is_long(scene: Plan, motion: Motion, few: int) -> bool:
         return motion.method != plans.AGGREGATE
     bounces = len(scene.ends) > 1 or scene.speed == 0.0
     return bounces and scene.solver == plans.SECOND_ORDER and len(motion.switches) > FEW_SWITCHES
-
-
-def _hard(scene: Plan, arrays: ChainArrays) -> bool:
-    """Whether an impact may bring a spring close to the end of its branch c."""
-    return bool(0.5 * scene.mass.item(-1) * scene.speed**2 >= 6.0 * arrays.steep)
 
 
 def _distances(scene: Plan, arrays: ChainArrays, motion: Motion) -> tuple[float, float]:
@@ -272,11 +260,9 @@ class Sensitivity:
 def _sensitivities(
     chain: Chain, names: Sequence[str], directions: Directions, slopes: Slopes
 ) -> dict[str, Sensitivity]:
-    """Return the derivatives of a run by parameter name.
-
-    The solver differentiates by η_site/H, on which η_site and every height act.
-    """
+    """Return the derivatives of a run by parameter name."""
     out = {}
+    # The solver differentiates by η_site/H, on which η_site and every height act.
     drag = chain.site_damping / chain.height
     for p, name in enumerate(names):
         motion, stress = slopes.displacement[p], slopes.base_stress[p]

@@ -82,16 +82,14 @@ def _enter(row, i, branch):
 
 @inner
 def _add(row, i, times):
-    """Add the strain of a spring to the polynomial, or subtract it (`times` -1).
-
-    On a curved branch ε = x0 + 1 - k/(k + S), a geometric series.
-    """
+    """Add the strain of a spring to the polynomial, or subtract it (`times` -1)."""
     shape, total, anchor = _shape(row, i), past(row, HEAD), row.anchor
     share, k = times * row[SPRINGS + i * OF_SPRING + 1], shape[STEEP]
     if not shape[CURVED] > 0.0:
         total[0] += share * (shape[ORIGIN] + (anchor - shape[OFFSET]) / k)
         total[1] += share * row.unit / k
         return
+    # On a curved branch ε = x0 + 1 - k/(k + S), a geometric series.
     ratio = row.unit / (k + anchor)
     total[0] += share * (shape[ORIGIN] + anchor / (k + anchor))
     term = share * k / (k + anchor) * ratio
@@ -199,10 +197,7 @@ def _switch(row, s, up, out):
 
 @contract.outer
 def _place(shapes, heights, branches, log, time, stress, free, nodes):
-    """Fill the displacements above all springs but the last, whose displacement is known.
-
-    From sample `free` on the chain flies with its top; `branches` are zeros.
-    """
+    """Fill displacements above all springs but the last, with which they fly from `free` on."""
     count, done = heights.size, 0
     for j in range(time.size):
         while done < log.shape[0] and log[done, 0] <= time[j]:

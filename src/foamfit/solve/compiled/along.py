@@ -77,10 +77,7 @@ def tabulate(x, h, table):
 
 @inner
 def quartic(first, middle, last, low, high):
-    """Return the coefficients 2 to 4 of a quartic with these values and slopes, and its `bump`.
-
-    That is what the middle adds to the cubic of the ends: bump times 16 r² (1-r)².
-    """
+    """Return coefficients 2 to 4 of a quartic; its middle adds `bump` 16 r² (1-r)² to the cubic."""
     rise, bump = last - first, middle - (0.5 * (first + last) + 0.125 * (low - high))
     square, cube = 3.0 * rise - 2.0 * low - high, low + high - 2.0 * rise
     return square + 16.0 * bump, cube - 32.0 * bump, 16.0 * bump, bump
@@ -88,20 +85,14 @@ def quartic(first, middle, last, low, high):
 
 @inner
 def integral(a, first, low, square, cube, fourth):
-    """Return ∫₀¹ exp(-x (1-r)) (first + low r + square r² + …) dr from the moments `a`.
-
-    From the next moments, a + 1, it returns the integral with another factor r: the sum of this
-    integral and its derivative by x.
-    """
+    """Return ∫₀¹ exp(-x (1-r)) (first + low r + square r² + …) dr from the moments `a`."""
+    # From the next moments, a + 1, it has another factor r: its sum with its derivative by x.
     return first * a[0] + low * a[1] + square * a[2] + cube * a[3] + fourth * a[4]
 
 
 @inner
 def relax(c, h, tables, first, low, square, cube, fourth, d_first, d_middle):
-    """Advance the relaxation terms and their derivatives over a step.
-
-    The stress is the quartic with these coefficients.
-    """
+    """Advance relaxation terms and their derivatives over a step, in which stress is a quartic."""
     s, p, y = c.springs, c.p, c.y
     for k in range(c.terms):
         tau, a, dz = s.tau[k], past(tables, k * TABLE), past(y, c.base + k * p)
@@ -237,15 +228,23 @@ def go_to(c, eps, between, m, seed, tol, weight):
 def follow(ints, floats, rows, heights, mass, reals, strains, time, out, log, samples):
     """Follow one spring, without its dashpot, along strains from rest.
 
-    `samples` (n, 4) are derivatives by a shift of the motion, see `histories.at_samples`, then
-    branch and slope dσ/dε, which are filled. Return DONE, NOT_FINITE, or UNFIT if the law needs
-    another solver.
+    `samples` (n, 4) become the derivative by a shift of the motion in contact, as the factors of 1
+    and ε, then branch and slope dσ/dε. Return DONE, NOT_FINITE, or UNFIT if the law needs another
+    solver.
     """
     c = begin_run(ints, floats, time, strains, out, log, rows, heights, mass, reals)
     s, t, tol, n, weight, m = c.springs, c.time, reals[3], c.samples, 0.0, c.batch
     lasts = t[n - 1] - t[0]
     for k in range(c.terms):
         weight += s.g[k] * min(1.0, lasts / s.tau[k])
+    before = 0.0
+    for j in range(n):
+        contact = 1.0 if c.values[j] != 0.0 else 0.0
+        samples[j, 0], samples[j, 1] = contact, 0.0
+        if j > 0 and contact != before:  # it begins or ends before this sample
+            rise = 1.0 / (c.values[j] - c.values[j - 1]) * (contact - before)
+            samples[j, 0], samples[j, 1] = 0.0, rise
+        before = contact
     bring_to(c, 0.0)
     derive(c, start(samples))
     if c.fade_at:

@@ -58,10 +58,8 @@ AIMED = 0.77  # growth of a step whose dense output has an error of 1; few steps
 
 
 def _emit_sum(context, builder, signature, args):
-    """Add up four components at a time, in two sums that do not wait for each other.
-
-    The compiler makes such code of a plain loop only where components are many.
-    """
+    """Add up four components at a time, in two sums that do not wait for each other."""
+    # The compiler makes such code of a plain loop only where components are many.
     n, wide, first, last, scale, weights, sources, stage, begin, out = args
     four, together = ir.VectorType(ir.DoubleType(), 4), ("contract",)
     zero, one, two, quad = (context.get_constant(types.intp, k) for k in (0, 1, 2, 4))
@@ -101,10 +99,7 @@ _sum = contract.emitted(
 
 @inner
 def combine(c, n, row, scale, begin, out):
-    """Fill out = begin + scale Σ WEIGHT[k] stage[FROM[k]] of a row of coefficients.
-
-    Up to three components more than n are filled, for which all arrays have room.
-    """
+    """Fill out = begin + scale Σ WEIGHT[k] stage[FROM[k]], and up to three components above n."""
     k, last = BEGINS[row], BEGINS[row + 1]
     _sum(n, c.wide, k, last, scale, start(WEIGHT), start(FROM), c.stage, begin, out)
 
@@ -141,10 +136,7 @@ def error_of(c, dt, tol):
 
 @inner
 def make_dense(c, n, dt, at, tol, want):
-    """Fill the dense output of a step; return the size of its last term over the tolerance.
-
-    Where fast processes have died out, that exceeds the error at the end of the step by far.
-    """
+    """Fill the dense output of a step; return the size of its last term over the tolerance."""
     wide, line, stage, y, new = c.wide, c.line, c.stage, c.y, c.new
     for s in range(STEPPED + 1, ALL_STAGES):
         combine(c, n, s, dt, y, c.state)
@@ -155,6 +147,7 @@ def make_dense(c, n, dt, at, tol, want):
         line[2 * wide + i] = 2.0 * rise - dt * (last + stage[i])
     for q in range(4):
         combine(c, n, ALL_STAGES + q, dt, c.nil, past(line, (3 + q) * wide))
+    # Where fast processes have died out, that exceeds the error at the end by far.
     size, kinds, scales = 0.0, c.kinds, c.scales
     for i in range(c.base):
         most = max(scales[kinds[i]], abs(new[i]))
@@ -165,11 +158,7 @@ def make_dense(c, n, dt, at, tol, want):
 
 @run.stepping
 def step(c, want, tol, upto, most):
-    """Take one step, shorter ones until it is accurate; return how it ended.
-
-    `upto` is the time of the next sample inside the piece. A step that may contain a switch or
-    contains a sample has its dense output.
-    """
+    """Take one step, shorter ones until it is accurate; return how it ended."""
     r, again, n = c.now, False, c.base + c.carries * c.p
     if c.short_at and run.call_short(c, want, tol):
         return events.PLAIN + c.none
@@ -190,6 +179,7 @@ def step(c, want, tol, upto, most):
         if error > 1e-8:
             grow = min(6.0, max(0.3, 0.9 * error**-0.115 * r.last**0.02))
         r.grow = min(grow, 1.0) if again else grow
+        # A step that may contain a switch, or contains a sample, has its dense output.
         doubtful = events.suspicious(c, dt)
         if not doubtful and upto > r.now + dt:
             r.last = max(error, 1e-4)
@@ -277,10 +267,7 @@ def _restore(c):
 
 @inner
 def _balance(c, h, guess, near):
-    """Fill strains and stresses at the end of a step, and the terms; return the common stress.
-
-    The result is not a number if Newton's method does not converge at once, as in a narrow snap.
-    """
+    """Fill strains, stresses and terms at the end of a step; return the common stress, or NaN."""
     new, pushed, change, off = c.new, c.top == STRESS, 0.0, 0.0
     end = c.drive.value + c.drive.value_rate * (c.now.now + h)
     common = end if pushed else guess
@@ -307,6 +294,7 @@ def _balance(c, h, guess, near):
         for k in range(c.terms):
             x = h / s.tau[k]
             new[n.z_at + k] -= x * m[TABLES + k * TABLE + 2] * m[LAST]
+    # Newton's method does not converge at once in a narrow snap.
     return common if off <= 0.0 else math.nan
 
 

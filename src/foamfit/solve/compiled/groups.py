@@ -48,10 +48,7 @@ def strain_at(c, i, sigma):
 
 @inner
 def elongation_at(c, i0, i1, sigma, loose):
-    """Bring springs to a stress on their branches; return elongation, compliance, size of terms.
-
-    With `loose`, only the springs without a dashpot.
-    """
+    """Bring springs, or `loose` ones, to a stress; return elongation, compliance, size of terms."""
     total = compliance = size = 0.0
     for i in range(i0, i1):
         s = spring(c, i)
@@ -201,36 +198,24 @@ def solve_loose(c, g, i0, i1, reach, push, y):
 
 
 @inner
-def _close(c, i0, i1, rest):
-    """Give what rounding leaves of the rate of elongation to the spring with the lightest dashpot.
-
-    Rounding errors of S - T over a light dashpot would change the elongation, and nothing resists.
-    """
-    least, where = math.inf, i0
-    for i in range(i0, i1):
-        s = spring(c, i)
-        if s.eta < least * s.height:
-            least, where = s.eta / s.height, i
-    s = spring(c, where)
-    s.rate += rest / s.height
-
-
-@inner
 def share_rate(c, g, i0, i1, rate, loose, flat, pushed):
     """Fill the strain rates of a group of several springs; `pushed`: its stress is prescribed."""
     soft, rest, climb, common = 0.0, rate, c.drive.value_rate, c.carried[g]
+    least, lightest = math.inf, spring(c, i0)
     for i in range(i0, i1):
         s = spring(c, i)
         if s.eta > 0.0:
             s.rate = (common - s.total) / s.eta
             rest -= s.height * s.rate
+            if s.eta < least * s.height:
+                least, lightest = s.eta / s.height, s
         elif flat < 0:
             compliance = s.height / (s.gain * s.tangent)
             soft += compliance
             rest += compliance * s.drift
     if loose < 0:
-        if not pushed:
-            _close(c, i0, i1, rest)
+        if not pushed:  # rounding errors of S - T would change the elongation, and nothing resists
+            lightest.rate += rest / lightest.height
         return
     if not pushed and flat < 0:
         climb = rest / soft
@@ -389,10 +374,7 @@ def elongation(c, i0, i1):
 
 @inner
 def _yield_flat(c, i0, i1, rest, y):
-    """Let springs on flat branches take an elongation, from the base up; return what is left.
-
-    One that reaches the end of its branch leaves it; the second value says so.
-    """
+    """Let flat branches take an elongation from the base up; return the rest, and if one ended."""
     up = rest > 0.0
     for i in range(i0, i1):
         s = spring(c, i)

@@ -51,14 +51,6 @@ def direct(c, i, change, own, out):
 
 
 @inner
-def _path(c, i):
-    """Fill dσ/dε along the path of the internal variables, and what their rates B add to dT/dt."""
-    s, values, size = spring(c, i), spring(c, i).by, 2 + 2 * numbers(c, i).internals
-    s.tangent = s.slope + values[ALONG_A * size]
-    s.drift = c.drive.pace * s.gain * values[ALONG_B * size]
-
-
-@inner
 def _part(c, i, y, part):
     """Fill the derivatives at fixed strain, by direction, and those of the stress."""
     n, p, x = numbers(c, i), c.p, numbers(c, i).internals
@@ -104,10 +96,7 @@ def _friction(c, i, quicker, out):
 
 @inner
 def _jump(c, i, up, y):
-    """Change the branch; the internal variables may jump, and their derivatives with them.
-
-    Their rates may jump too, so that the delay of the instant of the change counts.
-    """
+    """Change the branch; the internal variables may jump, and their derivatives with them."""
     s, n, p = spring(c, i), numbers(c, i), c.p
     x, pace = n.internals, c.drive.pace
     changes, first = contract.changes_of(spring(c, i).by, x), past(spring(c, i).by, 2)  # A, then B
@@ -120,6 +109,7 @@ def _jump(c, i, up, y):
         return
     wide = 1 + x + n.parameters
     end, out = past(changes, x * wide), past(changes, (x + 1) * wide)
+    # Rates may jump too, so that the delay of the instant of the change counts.
     faster = s.rate * (1.0 - end[0])  # of the strain past the end
     for k in range(x):
         faster -= end[1 + k] * (s.rate * first[k] + pace * first[x + k])
@@ -162,7 +152,10 @@ def inside_task(c, task, i, up, y, f, quicker, out):
     elif task == motion.FRICTION:
         _friction(c, i, quicker, out)
     elif task == motion.PATH:
-        _path(c, i)
+        # dσ/dε along the path of the internal variables, and what their rates B add to dT/dt
+        s, values, size = spring(c, i), spring(c, i).by, 2 + 2 * numbers(c, i).internals
+        s.tangent = s.slope + values[ALONG_A * size]
+        s.drift = c.drive.pace * s.gain * values[ALONG_B * size]
     else:
         _jump(c, i, up, y)
 

@@ -44,11 +44,8 @@ def _first_step(c, tol):
 
 @inner
 def _mend(c, y):
-    """Bring what is integrated besides the state back to it: one step of Newton's method.
-
-    So the stress of a BY_STRESS law stays that of its strain, and springs without a dashpot in one
-    group keep one stress. Return whether the state has changed.
-    """
+    """Bring what is integrated besides the state back to it; return whether the state changed."""
+    # By Newton: stresses stay those of strains, and springs without dashpots keep one stress.
     changed = False
     for g in range(c.none if not c.solved else c.groups, c.groups):
         i0, soft, mean, count = c.first[g], 0.0, 0.0, 0
@@ -173,15 +170,12 @@ def _finish_step(c, struck):
 
 @inner
 def _fresh_scales(c):
-    """Let the scales of the error cover what the next step may reach.
-
-    A dashpot under a mass that hardly moves makes the base stress of its velocity, so each node has
-    a scale of its own, down to LEAST_SHARE of the largest.
-    """
+    """Let the scales of the error cover what the next step may reach."""
     y, rate, scales, kinds, part = c.y, c.stage, c.scales, c.kinds, 0.1 * c.now.step
     for k in range(c.base):
         kind = kinds[k]
         scales[kind] = max(scales[kind], max(abs(y[k]), part * abs(rate[k])))
+    # A dashpot under a mass that hardly moves makes base stress of its velocity.
     for k in range(2 * c.nodes):
         shared = run.OF_V if k % 2 else run.OF_W
         scales[shared] = max(scales[shared], scales[kinds[k]])
@@ -192,11 +186,8 @@ def _fresh_scales(c):
 
 @inner
 def _longest(c, want):
-    """Return the longest step.
-
-    The error of a step keeps relaxation terms stable, but not their derivatives: near the limit of
-    stability these grow by many steps before that error is seen.
-    """
+    """Return the longest step."""
+    # Near the limit of stability, derivatives of relaxation terms grow before errors are seen.
     longest = math.inf
     if want and c.degree == 0:
         for i in range(c.count):
@@ -309,13 +300,21 @@ def _is_damped(c):
     return damped
 
 
-@inner
-def _next_piece(c, want):
-    """Write the sample at the end of a piece, and begin the next; return whether it was the last.
+@run.driving
+def next_piece(c, starts, want):
+    """Start from rest, or write a sample and begin the next piece; return whether it was the last.
 
     Dashpots have the mean rate at a sample where the prescribed rate jumps.
     """
     r, k, t = c.now, int(c.now.piece) + 1, c.time
+    if starts:
+        if c.values[0] != 0.0 and (c.top == MOTION or c.top == STRESS):
+            _begin_ramp(c, want)
+            return c.none
+        _begin_piece(c, c.none)
+        rates(c, c.y, c.stage, want, 0.0)
+        write(c, c.y, 0.0, c.none, want)
+        return int(c.samples == 1)
     if k == 0:  # after a ramp
         _end_ramp(c, want)
         _begin_piece(c, k)
@@ -338,29 +337,12 @@ def _next_piece(c, want):
     return c.none
 
 
-@run.driving
-def next_piece(c, starts, want):
-    """Start from rest, or begin the next piece; return whether all samples are written."""
-    if not starts:
-        return _next_piece(c, want)
-    if c.values[0] != 0.0 and (c.top == MOTION or c.top == STRESS):
-        _begin_ramp(c, want)
-        return c.none
-    _begin_piece(c, c.none)
-    rates(c, c.y, c.stage, want, 0.0)
-    write(c, c.y, 0.0, c.none, want)
-    return int(c.samples == 1)
-
-
 # ---------------------------------------------------------------- from step to step
 
 
 @run.advancing
 def advance(c, how, struck, want):
-    """Go to the first event in the step or to its end, and write its samples.
-
-    Return what happened: nothing, an event, the end of contact, or an event without any progress.
-    """
+    """Go to the first event in the step or to its end, write its samples, return what happened."""
     r, share, who, kind = c.now, 1.0, -1, -1
     if how == events.DOUBTFUL:
         share, who, kind = events.first_event(c)

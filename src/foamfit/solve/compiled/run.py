@@ -134,10 +134,7 @@ _as_numbers, _as_record = contract.pointing(_NUMBERS), contract.pointing(RECORD)
 
 
 def _pointed(field: str, returns: Any, *takes: Any) -> tuple[Callable[..., contract.Pointed], Any]:
-    """Return a decorator for functions whose address is in a field, and what calls them.
-
-    They take the record and numbers of these types.
-    """
+    """Return a decorator for functions with their address in a field, and what calls them."""
     signature = returns(RECORD, *takes)
 
     def emit(context, builder, given, args):

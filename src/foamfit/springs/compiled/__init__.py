@@ -32,10 +32,7 @@ def compiled(law: Law) -> Compiled:
 
 
 def slopes_of(laws: Sequence[Compiled], rows: Array) -> Array:
-    """Return slopes dσ/dε (Pa) at zero stress of springs with these rows of their laws, (2, n).
-
-    The first is that at rest, the second that of the steepest branch.
-    """
+    """Return slopes dσ/dε (Pa) at zero stress: at rest, and of the steepest branch, (2, n)."""
     found = [[rows.item(i, column) for column in one.slopes] or [1.0] for i, one in enumerate(laws)]
     return np.array([[one[0] for one in found], [max(one) for one in found]])
 

@@ -385,10 +385,7 @@ def emitted(signature: Any, emit: Callable[..., Any]) -> Any:
 
 
 def pointed(returns: Any, *takes: Any) -> tuple[Callable[[Callable[..., Any]], Pointed], Any]:
-    """Return a decorator for functions of this signature, and what calls them by their address.
-
-    The address is the first argument of a call.
-    """
+    """Return a decorator for functions of this signature, and a call of the one at an address."""
     return partial(Pointed, returns(*takes)), emitted(returns(WHOLE, *takes), by_address)
 
 

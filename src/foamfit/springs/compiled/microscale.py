@@ -130,13 +130,10 @@ def _enter(row, s, branch):
 
 @inner
 def _hold(row, s, rank):
-    """Hold the present rank.
-
-    In a narrow snap the last digit of the stress covers many ranks, so the snapped share is
-    corrected to match the strain.
-    """
+    """Hold the present rank."""
     p, rest = shares(rank)
     sigma = s.x
+    # In a narrow snap the last digit of the stress covers many ranks, so the strain decides.
     eps, _, _, on_main, _ = mix.mixture(row, FIXED, p, rest, s.never, sigma)
     more = (s.eps - eps) / (row.star + sigma / (row.kc + sigma) - on_main)
     if abs(more) < min(mix.ROUNDED, p, rest):

@@ -56,10 +56,7 @@ def density(rank):
 
 @inlined
 def on_a(n, k, sigma):
-    """Return strain a(σ; k) (-inf past its pole) and its derivatives by σ, σ twice, and n.
-
-    That by n = 1, which few need, is left at zero; see `by_stiffening`.
-    """
+    """Return a(σ; k), -inf past its pole, and derivatives by σ, σ twice, and n (0 if n = 1)."""
     above = k + n * sigma
     if not above > 0.0:
         return -math.inf, 0.0, 0.0, 0.0
@@ -116,10 +113,7 @@ def crossing(log_plus: float, spread_plus: float, log_minus: float, spread_minus
 
 @inner
 def mixture(row, branch, p, rest, never, sigma):
-    """Return the strain at a stress, given p, 1 - p and 1 - P, and two derivatives at fixed p, P.
-
-    The last two values are strain and slope of the branch a that snaps.
-    """
+    """Return strain and two derivatives at fixed p, P; strain and slope of the a that snaps."""
     n, k = row.n, row.worn
     two = 1.0 / (row.kc + sigma)
     on_c = row.kc * two * two
@@ -184,10 +178,7 @@ def _halfway(low, high, sigma):
 
 @inner
 def stress_in(row, s, eps):
-    """Return the stress at a strain on the branch, infinite past its end, and dε/dσ, 0 if unknown.
-
-    The method is Halley's inside a bracket, from a parabola at the previous point.
-    """
+    """Return the stress at a strain on the branch (inf past its end), and dε/dσ, 0 if unknown."""
     branch = int(s.branch)
     reach = 1.0 + (row.star if moves(branch) or s.snapped > 0.0 else 0.0)
     if not eps < reach:
@@ -204,6 +195,7 @@ def stress_in(row, s, eps):
         step = (eps - s.eps) / slope
         sigma += step * (1.0 - 0.5 * step * s.curvature / slope)
     narrow = min(row.plus, row.minus, 1.0) if moves(branch) else 1.0
+    # Halley's method inside a bracket, from a parabola at the previous point.
     for _ in range(300):
         reached, slope, bend = at_stress(row, s, sigma)
         miss = reached - eps

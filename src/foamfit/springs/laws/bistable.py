@@ -66,10 +66,8 @@ def derived_points(
 def admissible(
     k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
 ) -> bool:
-    """Return whether the seven parameters are admissible (docs/theory.md).
-
-    The other conditions follow from these: branch d lies above C2 and branch e below A1.
-    """
+    """Return whether the seven parameters are admissible (docs/theory.md)."""
+    # The other conditions follow: branch d lies above C2 and branch e below A1.
     return (
         0.0 < k0 < math.inf
         and 0.0 < kc < math.inf
@@ -289,10 +287,8 @@ def read_in_series(loop: Loop, marks: Array, share: float) -> Array:
 
 
 def _stiffness_between(rise: float, low: float, high: float) -> float:
-    """Return k_c of a branch c whose strain grows by `rise` from stress `low` to `high` (Pa).
-
-    It is the larger root k of rise (k+low)(k+high) = k (high-low), or √(low high) without a root.
-    """
+    """Return k_c of a branch c whose strain grows by `rise` from stress `low` to `high` (Pa)."""
+    # The larger root k of rise (k+low)(k+high) = k (high-low), or √(low high) without a root.
     gain = max(high - low, 1e-9 * high)
     rise = max(rise, 1e-6)
     b = gain - rise * (low + high)
@@ -342,10 +338,7 @@ def _likely(values: Array, seen: Mask, marks: Array) -> Array:
 
 
 def _fewer(values: Array, top: float) -> Iterator[Array]:
-    """Yield a spring that stays on branches a and d up to a stress, and one that stays on a.
-
-    Both have the same strain at this stress as the spring of `values`.
-    """
+    """Yield springs of the same strain at a stress: one on branches a and d, and one on a only."""
     k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus, eta = values
     sigma_a = _sigma_a(k0, eps_a)
     sigma_c, far = sigma_a + dsigma, 0.9 * LAST_STRAIN

@@ -289,11 +289,6 @@ _NOTE = (
 )
 
 
-def _marked(param: Param, mark: float) -> float:
-    """Return the start value of an optional parameter for a mark in [0, 1]."""
-    return 3.0 ** (2.0 * mark - 1.0) if param.is_logarithmic else param.start_limits[1] * mark
-
-
 def _law(*options: str) -> Law:
     """Return the law with the parameters of some options; without any, the basic law."""
     extra = tuple(param for option in options for param in _OPTIONAL[option])
@@ -319,7 +314,10 @@ def _law(*options: str) -> Law:
         last, top = float(np.max(loop.strain)), scales.stress
         first = max(loop.at(0.05 * last, loading=True), 0.002 * top) / (0.05 * last)
         k0, kc = first * 10.0 ** (1.2 * marks[0] - 0.4), top * 10.0 ** (2.3 * marks[1] - 0.5)
-        more = dict(zip(names, map(_marked, extra, marks[7:]), strict=True))
+        more = {
+            p.name: 3.0 ** (2.0 * mark - 1.0) if p.is_logarithmic else p.start_limits[1] * mark
+            for p, mark in zip(extra, marks[7:], strict=True)
+        }
         lowest = least(k0, kc, *(more[name] for name in also))
         star = lowest + 0.5 * marks[2] * (LAST_STRAIN - lowest)
         plus = max(loop.at((0.2 + 0.8 * marks[3]) * last, loading=True), 0.02 * top)

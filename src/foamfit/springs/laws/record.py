@@ -165,13 +165,10 @@ class Loop:
 
 
 def corners(strain: Array, stress: Array, count: int) -> Array:
-    """Return the corners of a polygon that approximates a curve, (count, 2), with its ends.
-
-    Each new corner is the sample farthest from the polygon so far, relative to the ranges of the
-    curve.
-    """
+    """Return the corners of a polygon that approximates a curve, (count, 2), with its ends."""
     x, y = strain / (np.ptp(strain) or 1.0), stress / (np.ptp(stress) or 1.0)
     chosen = [0, x.size - 1]
+    # Each is the sample farthest from the polygon so far, relative to the ranges of the curve.
     for _ in range(min(count, x.size) - 2):
         parts = np.clip(np.searchsorted(chosen, np.arange(x.size)), 1, len(chosen) - 1)
         low, high = np.array(chosen)[parts - 1], np.array(chosen)[parts]
