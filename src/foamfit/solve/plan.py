@@ -60,12 +60,8 @@ _FAILURES = {
     "branch (strain 1 on branch a, 1 + eps_star on branch c), or the stress by which a law in a "
     "chain resists the strain rate is zero at any rate",
 }
-_PULLED = (
-    run.FLAT_UNDER_STRESS,
-    run.NOT_FINITE,
-)  # of a unilateral spring under a prescribed tension
-# Outcomes of explicit steps after which implicit ones are tried.
-_STIFF = run.TOO_MANY_STEPS, run.STEP_UNDERFLOW
+_PULLED = run.FLAT_UNDER_STRESS, run.NOT_FINITE  # of a unilateral spring under tension
+_STIFF = run.TOO_MANY_STEPS, run.STEP_UNDERFLOW  # after which implicit steps are tried
 LOGGED = 64
 AT_MOST = 1e-9  # error of an elongation over the height, or over the largest elongation
 

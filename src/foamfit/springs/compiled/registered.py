@@ -9,7 +9,6 @@ compiled once for all, and call it by the address that its spring keeps in memor
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -374,32 +373,24 @@ def compile_law(law: Law) -> contract.Compiled:
         return 0.0
 
     functions = (begin, _evaluate, _switch, contract.settle, _strain)
-    addresses = tuple(one.address for one in functions)
+    addresses = np.array([one.address for one in functions])
     kept.append((formulas, begin))  # the addresses stay valid
     # parameters, slope at rest, then room for complex numbers
     columns = count + 1 + 2 * (2 + inside + count + max(3, 2 + 2 * inside))
-    size = contract.RESULTS + contract.results_of(count, inside)
-    fill = _fill(given.admissible, count, addresses, size)
+    work = np.zeros(contract.RESULTS + contract.results_of(count, inside))
+
+    def fill(values: Array, row: Array) -> bool:
+        row[:count] = values
+        fine = np.isfinite(values).all()
+        if not (fine and (given.admissible is None or given.admissible(values))):
+            return False
+        slope = float(slope_at_rest(addresses, row, work))
+        row[count] = slope if 0.0 < slope < math.inf else 1.0
+        return True
+
     flows = contract.FADES if given.decay else contract.STILL
     if given.along or given.viscous or (given.decay and (given.ends or given.switch)):
         flows = contract.FLOWS
     return contract.Compiled(
         fill, kind, columns, count, inside, functions, (count,), -1, viscous, flows
     )
-
-
-def _fill(
-    admissible: Callable[[Array], bool] | None, count: int, addresses: tuple[int, ...], size: int
-) -> Callable[[Array, Array], bool]:
-    """Return the function that writes a row."""
-    where, work = np.array(addresses), np.zeros(size)
-
-    def fill(values: Array, row: Array) -> bool:
-        row[:count] = values
-        if not np.isfinite(values).all() or not (admissible is None or admissible(values)):
-            return False
-        slope = float(slope_at_rest(where, row, work))
-        row[count] = slope if 0.0 < slope < math.inf else 1.0
-        return True
-
-    return fill
