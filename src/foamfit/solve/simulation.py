@@ -326,9 +326,8 @@ def simulate(
                 f"range, more than rtol = {rtol:g}: use a larger rtol or more samples"
             )
     end = None if math.isnan(motion.contact_end) else motion.contact_end
-    slopes: dict[str, Sensitivity] = {}
-    if motion.slopes is not None:
-        slopes = _sensitivities(chain, sensitivities, directions, motion.slopes)
+    given = motion.slopes
+    slopes = _sensitivities(chain, sensitivities, directions, given) if given else {}
     return Response(  # positional, as keywords are slower
         scene.time, motion.displacement, motion.base_stress, chain.height, end,
         scene.solver, motion.method, motion.switches, motion.steps, slopes,

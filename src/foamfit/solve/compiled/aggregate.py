@@ -216,10 +216,8 @@ def _place(shapes, heights, branches, log, time, stress, free, nodes):
 def nodes_and_switches(
     row: Array, heights: Array, times: Array, time: Array, end: float, out: Array
 ) -> Array:
-    """Fill the displacements of all nodes, and return the switches of the springs (n, 5).
-
-    `row` is that of the run, `times` those of its changes of branch, `end` that of the contact.
-    """
+    """Fill the displacements of all nodes, and return the switches of the springs (n, 5)."""
+    # `row` is that of the run, `times` those of its changes of branch, `end` of the contact.
     count, leaves = int(row[0]), int(row[1])
     first = SPRINGS + count * OF_SPRING
     log = row[first + 4 * leaves :][: 5 * int(row[_NAMES.index("switches")])].reshape(-1, 5).copy()
@@ -233,11 +231,8 @@ def nodes_and_switches(
 
 
 def row_of(laws: tuple[contract.Compiled, ...], rows: Array, heights: Array) -> Array | None:
-    """Return the row of an aggregate; None if the springs cannot be one.
-
-    They must be undamped bistable and linear springs without flat branches and gaps; `rows` have no
-    relaxation terms.
-    """
+    """Return the row of an aggregate; None if the springs cannot be one."""
+    # Undamped bistable and linear springs, without flat branches, gaps and relaxation.
     if rows[:, 0].any() or not {bistable.COMPILED, bistable.LINEAR}.issuperset(laws):
         return None
     count = len(heights)

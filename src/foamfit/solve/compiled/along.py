@@ -130,11 +130,8 @@ def sum_up(c, j):
 
 @inner
 def step_to(c, part, h, m, seed, tol, weight):
-    """Step to a strain of the branch within h; false, unchanged, if the step is too long.
-
-    m: largest stress, share of the interval (negative if the law needs another solver), tables,
-    derivatives at the start, results of `fade` or derivatives in the middle.
-    """
+    """Step to a strain of the branch within h; false, unchanged, if the step is too long."""
+    # m: largest stress; share of the interval, negative if unfit; tables; derivatives at the start.
     s, p = c.springs, c.p
     tables, d_first = past(m, 2), past(m, 2 + c.terms * TABLE)
     room, fades = past(d_first, p), c.fade_at and c.drive.pace > 0.0

@@ -355,27 +355,22 @@ def _derive(c, h):
     _restore(c)
 
 
-@inner
-def _try(c, h, want, tol, guess):
-    """Fill the state at the end of a step; return the largest error over the one allowed."""
-    _prepare(c, h)
-    common = _balance(c, h, guess, min(NEAR, CLOSE * tol))
-    _restore(c)
-    rates(c, c.new, past(c.stage, STEPPED * c.wide), c.none, c.now.now + h)
-    return _correct(c, h, want, tol, common)
-
-
 @run.shortening
 def relaxing_step(c, want, tol):
     """Try one step up to the next sample, or a shorter one; return whether it was taken."""
     r, s, first, rest = c.now, c.springs, c.carried[0], c.now.horizon - c.now.now
     climb = s.gain * s.slope * s.rate + s.drift  # rate of the common stress
+    last = past(c.stage, STEPPED * c.wide)
     r.paused -= 1.0
     if r.paused >= 0.0 or not rest > 0.0 or not _keep(c):
         return c.none
     h = min(max(r.step, SHORTEST * rest), rest)
     while h >= SHORTEST * rest:
-        error = _try(c, h, want, tol, first + climb * h)
+        _prepare(c, h)
+        common = _balance(c, h, first + climb * h, min(NEAR, CLOSE * tol))
+        _restore(c)
+        rates(c, c.new, last, c.none, r.now + h)
+        error = _correct(c, h, want, tol, common)
         if error <= 1.0:
             break
         h *= max(0.2, 0.8 * error ** (-1.0 / 3.0)) if error < math.inf else 0.0
@@ -387,5 +382,5 @@ def relaxing_step(c, want, tol):
     r.step, r.taken = h, r.taken + 1.0
     r.grow = min(6.0, 0.8 * max(error, 1e-6) ** (-1.0 / 3.0))
     if h < rest:  # else the next piece does it
-        rates(c, c.new, past(c.stage, STEPPED * c.wide), want, r.now + h)
+        rates(c, c.new, last, want, r.now + h)
     return 1 + c.none

@@ -302,10 +302,7 @@ def _is_damped(c):
 
 @run.driving
 def next_piece(c, starts, want):
-    """Start from rest, or write a sample and begin the next piece; return whether it was the last.
-
-    Dashpots have the mean rate at a sample where the prescribed rate jumps.
-    """
+    """Start from rest, or write a sample and begin a piece; return whether it was the last."""
     r, k, t = c.now, int(c.now.piece) + 1, c.time
     if starts:
         if c.values[0] != 0.0 and (c.top == MOTION or c.top == STRESS):
@@ -326,6 +323,7 @@ def next_piece(c, starts, want):
     if k > 0:
         _begin_piece(c, k)
     rates(c, c.y, c.stage, want, 0.0)
+    # Dashpots have the mean rate at a sample where the prescribed rate jumps.
     if not jumps:
         write(c, c.y, 0.0, k, KNOWN + c.none)
     else:
@@ -422,11 +420,7 @@ def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log):
 
 
 def lost(strongest: float, moved: float, damped: float, motion: float, stress: float) -> float:
-    """Return the size of the vibrations that implicit steps damped out, relative to the ranges.
-
-    The arguments are results of a run: largest stress and displacement, vibrations damped out,
-    largest motion and stress of those that a sample lacks.
-    """
+    """Return the size of vibrations that were damped out over the ranges, from results of a run."""
     if motion > 0.0:
         share = motion / moved if moved > 0.0 else 0.0
         damped += max(share, stress / strongest)

@@ -38,11 +38,7 @@ def slopes_of(laws: Sequence[Compiled], rows: Array) -> Array:
 
 
 def fill_row(made: Compiled, values: Array, terms: Array, room: int, row: Array) -> bool:
-    """Fill the row of a spring for the solver; return whether it is admissible.
-
-    `values` are the parameters and eta. The row contains eta, `room` relaxation terms (g, τ), and
-    the row of the law.
-    """
+    """Fill a row: eta, `room` relaxation terms, row of the law; return if it is admissible."""
     own, eta = 1 + 2 * room, values.item(-1)
     fine = made.fill(values[:-1], row[own : own + made.columns]) and eta >= 0.0
     row[0] = eta

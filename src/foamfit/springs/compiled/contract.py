@@ -255,22 +255,15 @@ def _store(context, builder, signature, args, name):
     return builder.store(args[1], _place(builder, signature.args[0], args[0], name))
 
 
+_PLACES = {
+    name: first + k
+    for first, names in zip(_FIRST, SPRING_FIELDS, strict=True)
+    for k, name in enumerate(names)
+}
 SPRING = Named(
-    "Spring",
-    REAL,
-    {
-        name: first + k
-        for first, names in zip(_FIRST, SPRING_FIELDS, strict=True)
-        for k, name in enumerate(names)
-    },
-    point=EPS,
-    xs=X,
-    g=RELAX,
-    tau=RELAX + MOST_TERMS,
-    results=RESULTS,
-    by_held=RESULTS + BY_HELD,
-    by=RESULTS + BY,
-)
+    "Spring", REAL, _PLACES, point=EPS, xs=X, g=RELAX, tau=RELAX + MOST_TERMS, results=RESULTS,
+    by_held=RESULTS + BY_HELD, by=RESULTS + BY,
+)  # fmt: skip
 
 
 class Compiled(NamedTuple):

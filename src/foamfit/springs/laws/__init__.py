@@ -15,16 +15,14 @@ from types import ModuleType
 
 from foamfit.errors import InputError
 from foamfit.options import FREED
-from foamfit.springs.laws import bistable, microscale
-from foamfit.springs.laws.bistable import (
-    BistableSpring as BistableSpring,
-    LinearSpring as LinearSpring,
-)
+from foamfit.springs.laws import bistable, linear, microscale
+from foamfit.springs.laws.bistable import BistableSpring as BistableSpring
+from foamfit.springs.laws.linear import LinearSpring as LinearSpring
 from foamfit.springs.laws.microscale import MicroscaleSpring as MicroscaleSpring
 from foamfit.springs.laws.record import Functions as Functions, Law as Law, Param as Param
 
 ENTRY_POINTS = "foamfit.laws"
-_BUILT_IN = (*bistable.LAWS, *microscale.LAWS)
+_BUILT_IN = (bistable.LAW, linear.LAW, linear.UNILATERAL_LAW, *microscale.LAWS)
 _LAWS = {law.kind: law for law in _BUILT_IN}
 PAPER = tuple(_LAWS)  # built-in laws
 _TEXTS: dict[str, str] = {}  # text of each loaded law file, by path

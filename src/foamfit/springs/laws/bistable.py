@@ -1,17 +1,16 @@
-"""The springs of the paper: the hysteretic bistable one (eqs. 1-5) and the linear ones."""
+"""The hysteretic bistable spring of the paper (eqs. 1-5)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from foamfit.arrays import Array, Mask
-from foamfit.springs.laws import record
-from foamfit.springs.laws.record import LAST_STRAIN, Between, Law, Loop, Param, PointOf
+from foamfit.springs.laws.record import LAST_STRAIN, Between, Compared, Law, Loop, Param, PointOf
 from foamfit.springs.spring import Relaxation, Spring, freeze, require
 
 _INNER = (math.log(0.3), math.log(300.0))  # of stiffness divided by largest stress
@@ -180,44 +179,6 @@ class BistableSpring(Spring):
         return out
 
 
-@dataclass(frozen=True)
-class LinearSpring(Spring):
-    """The linear spring S1 of the two-spring models, σ = k0 ε, with a dashpot in parallel.
-
-    Parameters
-    ----------
-    k0 : float
-        Slope, Pa.
-    eta : float
-        η, dashpot in parallel, Pa·s.
-    unilateral : bool
-        Whether the spring carries no tension.
-
-    Raises
-    ------
-    ValueError
-        If a parameter is not admissible; the message names it.
-    """
-
-    k0: float
-    eta: float = 0.0
-    unilateral: bool = False
-
-    def __post_init__(self) -> None:
-        """Raise InputError for an inadmissible value; the message names it."""
-        freeze(self, LINEAR_LAW)
-
-    @property
-    def law(self) -> Law:
-        """The record of its law."""
-        return UNILATERAL_LAW if self.unilateral else LINEAR_LAW
-
-    @property
-    def relaxation(self) -> Relaxation:
-        """Relaxation terms; a linear spring has none."""
-        return ()
-
-
 def _sigma_a(k0: float, eps_a: float) -> float:
     """Return σ_a = k0 ε_a/(1-ε_a), Pa."""
     return k0 * eps_a / (1.0 - eps_a)
@@ -369,7 +330,7 @@ def _from_stresses(mixed: Array, height: float) -> Array:
     return np.array([k0, kc, min(sigma_c - sigma_a, 0.0), eps_a, eps_c, kh_plus, kh_minus])
 
 
-# ---------------------------------------------------------------- the records
+# ---------------------------------------------------------------- the record
 
 _DROP = Between(  # Δσ from 0 to -σ_a
     ("k0", "eps_a"),
@@ -432,38 +393,16 @@ LAW = Law(
     ),
     compared=(
         "k0",
-        record.Compared(
+        Compared(
             "Δσ/σ_a", "", ("dsigma", "k0", "eps_a"),
             lambda dsigma, k0, eps_a: dsigma * (1.0 - eps_a) / (k0 * eps_a),
         ),
         *("eta", "eps_a", "eps_c", "height"),
-        record.Compared("k_h+/k0", "", ("kh_plus", "k0"), lambda slope, k0: slope / k0),
-        record.Compared("k_h−/k0", "", ("kh_minus", "k0"), lambda slope, k0: slope / k0),
-        record.Compared("k_c/k0", "", ("kc", "k0"), lambda kc, k0: kc / k0),
+        Compared("k_h+/k0", "", ("kh_plus", "k0"), lambda slope, k0: slope / k0),
+        Compared("k_h−/k0", "", ("kh_minus", "k0"), lambda slope, k0: slope / k0),
+        Compared("k_c/k0", "", ("kc", "k0"), lambda kc, k0: kc / k0),
     ),
     note="A1 and C1 are where the spring starts to snap and has snapped on loading; C2 and A2 "
     "where it starts to snap back and has recovered on unloading.",
     remembers=False,
 )  # fmt: skip
-
-
-def _unilateral(k0: float, eta: float = 0.0) -> LinearSpring:
-    return LinearSpring(k0, eta, unilateral=True)
-
-
-LINEAR_LAW = Law(
-    kind="linear",
-    title="linear spring",
-    params=(replace(K0, what="slope", branch="", example="60 MPa"),),
-    functions="bistable.LINEAR",
-    branches={"line": "linear"},
-    hysteretic=False,
-    spring=LinearSpring,
-    remembers=False,
-)  # fmt: skip
-UNILATERAL_LAW = replace(
-    LINEAR_LAW, kind="unilateral", title="linear spring without tension", spring=_unilateral,
-    functions="bistable.UNILATERAL",
-    branches={"line": "linear", "open": "out of contact"},
-)  # fmt: skip
-LAWS = LAW, LINEAR_LAW, UNILATERAL_LAW
