@@ -263,23 +263,23 @@ def _stiffness_between(rise: float, low: float, high: float) -> float:
 STEEP = np.geomspace(1.0, 1000.0, 7)
 
 
-def steeper(values: Array, kc: int, start: int, top: float, low: float) -> Iterator[Array]:
+def steeper(values: Array, start: int, top: float, low: float) -> Iterator[Array]:
     """Yield springs with another k_c whose branch c has the same strain at the largest stress.
 
-    A search that changes only k_c misses a steep branch c. `kc` and `start` are the indices of k_c
-    and of the strain at which branch c begins, at the stress `low`.
+    A search that changes only k_c misses a steep branch c. `start` is the index of the strain at
+    which branch c begins, at the stress `low`; k_c is the second parameter.
     """
     for other in top * STEEP:
         moved = values.copy()
-        moved[kc] = other
-        rises = [top / (k + top) - low / (k + low) for k in (values[kc], other)]
+        moved[1] = other
+        rises = [top / (k + top) - low / (k + low) for k in (values[1], other)]
         moved[start] += rises[0] - rises[1]
         yield moved
 
 
 def _neighbours(values: Array, top: float) -> Iterator[Array]:
     k0, _, dsigma, eps_a = values[:4]
-    return steeper(values, 1, 4, top, _sigma_a(k0, eps_a) + dsigma)
+    return steeper(values, 4, top, _sigma_a(k0, eps_a) + dsigma)
 
 
 def _likely(values: Array, seen: Mask, marks: Array) -> Array:

@@ -195,7 +195,7 @@ def _least_star(k0: float, kc: float, stiffening: float = 1.0, softening: float 
 
 def _neighbours(values: Array, top: float) -> Iterator[Array]:
     """Yield springs with a steeper branch c, and one that snaps back where it snaps."""
-    yield from steeper(values, 1, 2, top, 0.0)
+    yield from steeper(values, 2, top, 0.0)
     back = values.copy()
     back[5:7] = values[3:5]
     yield back
