@@ -7,8 +7,8 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 from foamfit.data.measurement import interior_channel
-from foamfit.fitting.branches import covered
 from foamfit.fitting.nuisance import POSITIVE
+from foamfit.parts import covered
 from foamfit.report.figures import images
 from foamfit.report.plots import origin_word
 from foamfit.report.readable import Readable, readable

@@ -16,9 +16,8 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.codec import build
 from foamfit.errors import InputError
-from foamfit.fitting.links import KINDS, RATES
 from foamfit.fitting.nuisance import TIME_SHIFT
-from foamfit.options import DRIVES
+from foamfit.options import DRIVES, KINDS, RATES
 from foamfit.parts import ParameterEstimate
 from foamfit.report.folder import Result, load_result
 from foamfit.springs.model import Model

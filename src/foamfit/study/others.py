@@ -17,13 +17,12 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.rig import Candidate, Rig
 from foamfit.fitting import levenberg
-from foamfit.fitting.links import Links
-from foamfit.fitting.minima import in_order
-from foamfit.fitting.together import Layout
+from foamfit.fitting.together import Layout, Links
 from foamfit.springs.model import exchanges
 from foamfit.study import gain
 from foamfit.study.gain import Known, Other, Test
 from foamfit.trust.covariance import WEAK
+from foamfit.trust.settle import in_order
 
 MOST, STEPS = 8, 10  # number of other springs that are fitted to a drawn foam, and of their steps
 NEAR = 60.0  # largest rise of the sum of squares, noise having a variance of 1

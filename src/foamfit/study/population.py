@@ -17,7 +17,8 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Specimen
 from foamfit.errors import InputError
 from foamfit.fitting.box import is_logarithmic
-from foamfit.fitting.links import RATES, factor
+from foamfit.fitting.together import factor
+from foamfit.options import RATES
 from foamfit.parts import Pair, ParameterEstimate
 from foamfit.springs.parameters import split_name
 from foamfit.study.identified import NORMAL, Source

@@ -14,8 +14,7 @@ from typing import Any
 from foamfit.data import toml_file
 from foamfit.data.toml_file import Check, Rule, checked, motion_file, table_of
 from foamfit.errors import InputError, naming
-from foamfit.fitting.links import KINDS
-from foamfit.options import FREED, OF_FIT
+from foamfit.options import FREED, KINDS, OF_FIT
 from foamfit.report.folder import FILES
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
@@ -50,8 +49,8 @@ _KEYS: dict[str, Check] = {
 class Study:
     """The content of a study file.
 
-    `kinds` maps parameters to one of `links.KINDS` or "auto"; `held` maps fixed parameters to their
-    values (SI).
+    `kinds` maps parameters to one of `options.KINDS` or "auto"; `held` maps fixed parameters to
+    their values (SI).
     """
 
     path: Path

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from foamfit.fitting.links import RATES
+from foamfit.options import RATES
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, TWO, VERMILION
 from foamfit.report.plots import draw_loops
