@@ -279,3 +279,17 @@ def test_what_smells_wrong_is_noted(specimen, striker, words):
     told = (*done.notes, *audit(done).warnings())
     assert any(note.startswith("Check:") and words in note for note in told)
     assert not any(note.startswith("Check:") for note in run(impact()).notes)
+
+
+@pytest.mark.parametrize("striker", [None, STRIKER])
+@pytest.mark.parametrize("spikes", [[0], [-1], [90], [40, 120]])
+@pytest.mark.parametrize("channel", ["stress", "displacement"])
+def test_a_channel_that_is_constant_but_for_single_rows_is_refused(channel, spikes, striker):
+    loop = np.sin(np.linspace(0.0, np.pi, 200))
+    flat = np.full(200, 0.5) + 1e-16 * loop
+    flat[spikes] = 0.9
+    scaled = {"stress": 1e6 * loop, "displacement": 4e-4 * loop}
+    scaled[channel] *= flat / loop.clip(1e-9)
+    record = Record(np.linspace(0.0, 1e-3, 200), **scaled)
+    with pytest.raises(InputError, match=f"the {channel} is constant but for single rows"):
+        condition(record, SPECIMEN, striker=striker)

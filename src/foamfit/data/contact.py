@@ -331,7 +331,7 @@ def rise_of(
         sigma, tau = scatter
     size = float(up[-1]) - base
     # A soft start may be hidden by noise in single samples; any length of rest may precede it.
-    width = 1 + (up.size - rest) // _WINDOWS
+    width = 1 + max(up.size - rest, 0) // _WINDOWS
     clear = _CLEAR * sigma * np.sqrt(min(tau / width, 1.0))
     level = min(max(_RISE_SHARE * size, clear), _LARGEST * size)
     part = _first_rise(smooth(up, width) - base, level)

@@ -49,6 +49,7 @@ _USUAL = {
     "modulus (peak stress over peak strain)": (10.0, 1e11, "Pa"),
     "duration": (1e-6, 1e7, "s"),
 }
+_ROUNDING = 1e-12  # share of its values by which a constant channel may vary
 _WHOLE, _UNKNOWN = Window(), Noise()  # the whole file; no noise is stated
 
 
@@ -69,6 +70,7 @@ def condition(
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
     record = repair.cut_strays(cut_to_window(record, window))
     record = repair.mark_clipped(repair.bridge_outliers(record))
+    _check_varying(record)
     still = [] if impact else repair.find_standstills(record)
     record, held = repair.fill_staircase(record)
     record = repair.bridge_standstills(record, still, specimen.height)
@@ -228,6 +230,14 @@ def cut_to_window(record: Record, window: Window) -> Record:
         if np.ptp(values) == 0:
             raise InputError(f"the {name} is constant within [window]; it must vary.")
     return record
+
+
+def _check_varying(record: Record) -> None:
+    """Raise InputError for a channel that varies only at its ends, in spikes or by rounding."""
+    for name, values in record.curves().items():
+        inner = values[1:-1]
+        if np.ptp(inner) <= _ROUNDING * np.abs(inner).max():
+            raise InputError(f"the {name} is constant but for single rows; it must vary.")
 
 
 def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> Record:

@@ -156,7 +156,7 @@ def find_table(text: Text, names: set[str | int]) -> Table:
     if found is None or not any(map(_is_sample, grids[found[0]][found[1] :])):
         rows = (sum(map(_is_sample, grid)) > 2 for grid in grids.values())
         tabbed = None if any(rows) else blanks_as_tabs(text.content)
-        if tabbed is not None:
+        if tabbed not in (None, text.content):
             return find_table(replace(text, content=tabbed), names)
     separator, i = found or _above_numbers(grids, names)
     grid = grids[separator]
