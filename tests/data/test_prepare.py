@@ -293,3 +293,16 @@ def test_a_channel_that_is_constant_but_for_single_rows_is_refused(channel, spik
     record = Record(np.linspace(0.0, 1e-3, 200), **scaled)
     with pytest.raises(InputError, match=f"the {channel} is constant but for single rows"):
         condition(record, SPECIMEN, striker=striker)
+
+
+def test_a_tiny_impact_is_refused():
+    """Seven rows have no tail of eight, from which a zero was to be taken."""
+    with pytest.raises(InputError, match="at least 10 needed"):
+        run(impact(n=6))
+
+
+def test_a_gauge_that_moves_only_after_contact_is_refused():
+    record = impact(before=0.5, after=1.0)
+    dead = np.where(record.time < 1.5 * DURATION, 0.0, record.displacement)
+    with pytest.raises(InputError, match="the displacement does not vary in the part that is used"):
+        run(replace(record, displacement=dead))

@@ -231,3 +231,12 @@ def test_a_bistable_fit_says_what_partial_unloading_leaves(inner: ff.Measurement
     assert f"these 45 % of the samples account for {100.0 * inside:.2g} % of the squared" in told
     assert "microscale springs do" in told
     assert told in " ".join(summary_text(fit, verbose=True).split())
+
+
+@pytest.mark.parametrize("drive", [None, "stress"])
+def test_a_record_of_the_unloading_alone_is_refused(drive):
+    falling = np.linspace(1.0, 0.0, 120)
+    motion = 0.1 * HEIGHT * (falling - 1.0)
+    test = loop_measurement(1e6 * falling, motion, SPECIMEN)
+    with pytest.raises(ff.InputError, match="the displacement does not rise"):
+        ff.fit(test, drive=drive, starts=1, intervals="local")

@@ -347,6 +347,11 @@ def checks(record: Record, specimen: Specimen, *, several: bool) -> Record:
     peak = float(record.stress.max())
     if peak <= 0.0:
         raise _never_positive(record.stress)
+    for name, values in record.curves().items():
+        measured = values[record.sampled.get(name, slice(None))]
+        if not measured.size or np.ptp(measured) == 0:
+            wrong = f"the {name} does not vary in the part that is used"
+            raise InputError(f"{wrong}; correct its column, or choose another part by [window].")
     duration = 1.0 if record.time is None else float(np.ptp(record.time))
     sizes = height, specimen.area, strain, peak, peak / strain if strain > 0 else 1e3, duration
     for value, (name, (low, high, unit)) in zip(sizes, _USUAL.items(), strict=True):

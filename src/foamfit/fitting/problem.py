@@ -82,6 +82,9 @@ def make_params(
     if measurement.time is None and wanting:
         end = "; give one, or leave relaxation out" if model.relaxation else ""
         raise InputError(f"{measurement.name}: {wanting[0]} needs a time column{end}")
+    if (motion := measurement.displacement) is not None and motion.max() <= motion[0]:
+        wrong = f"{measurement.name}: the displacement does not rise in the part that is used"
+        raise InputError(f"{wrong}; choose a part with a loading by [window]")
     params, count = lmfit.Parameters(), len(model.kinds)
     fast = drive == "impact"
     on_striker = fast and (count > 1 or balance(measurement).damping is not None)
