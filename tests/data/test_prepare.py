@@ -306,3 +306,12 @@ def test_a_gauge_that_moves_only_after_contact_is_refused():
     dead = np.where(record.time < 1.5 * DURATION, 0.0, record.displacement)
     with pytest.raises(InputError, match="the displacement does not vary in the part that is used"):
         run(replace(record, displacement=dead))
+
+
+@pytest.mark.parametrize(("offset", "told"), [(-0.2, "starts below zero, at −18.4"), (0.2, "17 %")])
+def test_a_slow_record_that_starts_with_a_stress_is_doubted(offset, told):
+    """A zero of the force that was never set moved all stresses, and nothing was said."""
+    loop = np.sin(np.linspace(0.0, np.pi, 200))
+    done = condition(Record(None, 1e5 * (loop + offset), 4e-4 * loop), SPECIMEN)
+    (note,) = (one for one in done.notes if one.startswith("Check:"))
+    assert told in note

@@ -49,6 +49,7 @@ _USUAL = {
     "modulus (peak stress over peak strain)": (10.0, 1e11, "Pa"),
     "duration": (1e-6, 1e7, "s"),
 }
+_AT_START = 0.05  # share of the peak that a stress may have at the start
 _ROUNDING = 1e-12  # share of its values by which a constant channel may vary
 _WHOLE, _UNKNOWN = Window(), Noise()  # the whole file; no noise is stated
 
@@ -367,10 +368,12 @@ def checks(record: Record, specimen: Specimen, *, several: bool) -> Record:
         if largest > 1.05 * displacement.max():
             notes.append(f"Check: {name} goes farther than the top; check its unit and its node.")
     stress = record.stress  # a fast ramp may load the second row
-    first = min(stress[:3].mean(), stress[0] + 3.0 * noise_level(stress))
-    if first > 0.05 * peak:
-        load = percent(first / peak)
-        notes.append(f"Check: {zeros.UNDER_LOAD}, at {load} of the peak stress.")
+    noise, first = 3.0 * noise_level(stress), float(stress[:3].mean())
+    if (load := min(first, float(stress[0]) + noise)) > _AT_START * peak:
+        notes.append(f"Check: {zeros.UNDER_LOAD}, at {percent(load / peak)} of the peak stress.")
+    if (load := max(first, float(stress[0]) - noise)) < -_AT_START * peak:
+        wrong = f"the stress starts below zero, at {engineering(load, 'Pa')}"
+        notes.append(f"Check: {wrong}; if that is no tension, correct its zero in the file.")
     lowest, width = lowest_mean(stress, int(np.argmax(stress)))
     if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
         after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"
