@@ -371,8 +371,8 @@ def checks(record: Record, specimen: Specimen, *, several: bool) -> Record:
     noise, first = 3.0 * noise_level(stress), float(stress[:3].mean())
     if (load := min(first, float(stress[0]) + noise)) > _AT_START * peak:
         notes.append(f"Check: {zeros.UNDER_LOAD}, at {percent(load / peak)} of the peak stress.")
-    if (load := max(first, float(stress[0]) - noise)) < -_AT_START * peak:
-        wrong = f"the stress starts below zero, at {engineering(load, 'Pa')}"
+    if first + noise < -_AT_START * peak:
+        wrong = f"the stress starts below zero, at {engineering(first, 'Pa')}"
         notes.append(f"Check: {wrong}; if that is no tension, correct its zero in the file.")
     lowest, width = lowest_mean(stress, int(np.argmax(stress)))
     if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
