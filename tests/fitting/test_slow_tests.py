@@ -240,3 +240,13 @@ def test_a_record_of_the_unloading_alone_is_refused(drive):
     test = loop_measurement(1e6 * falling, motion, SPECIMEN)
     with pytest.raises(ff.InputError, match="the displacement does not rise"):
         ff.fit(test, drive=drive, starts=1, intervals="local")
+
+
+def test_a_displacement_of_picometres_is_no_defect(tmp_path):
+    """The limits of its zero were equal for lmfit, which raised an error of its own."""
+    noise = 0.3 * np.random.default_rng(0).standard_normal(TIME.size)
+    columns = TIME, 100.0 * STRAIN + noise, 1e-9 * STRAIN
+    path = write_csv(tmp_path / "slow.csv", HEAD, *columns, toml=TOML)
+    result = ff.fit(ff.read_test(path), starts=1, intervals="local")
+    assert result.status == "failed"
+    assert "displacement_zero" not in result.parameters

@@ -203,6 +203,8 @@ def first_contact(record: Record) -> Record:
     share = (stress - free) / max(float(stress.max()) - free, 1e-300)
     edges = np.flatnonzero(np.diff(np.concatenate(([False], share > _AGAIN, [False]))))
     begins, ends = edges[::2], edges[1::2]
+    if not begins.size:
+        return record
     flights = begins[1:] - ends[:-1] > 2 * (ends - begins).max()
     impulses = np.add.reduceat(share.clip(0.0), begins)
     for i in np.flatnonzero(flights):

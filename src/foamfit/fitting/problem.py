@@ -192,9 +192,15 @@ def _add_nuisance(
     for name in nuisance.names_of(drive, time_shift=late):
         low, high = nuisance.limits_of(name, measurement, drive, scales.duration, late=late)
         origin = measurement.origins.get(name, 0.0)
-        open_ = low < high and (name != nuisance.FORCE_SCALE or shows_force)
-        limits = {"min": low + origin, "max": high + origin} if open_ else {}
+        low, high = low + origin, high + origin
+        open_ = not _alike(low, high) and (name != nuisance.FORCE_SCALE or shows_force)
+        limits = {"min": low, "max": high} if open_ else {}
         params.add(name, value=usual[name] + origin, vary=name in free and open_, **limits)
+
+
+def _alike(low: float, high: float) -> bool:
+    """Return whether lmfit takes two limits for equal."""
+    return high <= low or bool(np.isclose(low, high, rtol=1e-13, atol=1e-13))
 
 
 def _counted_from(
