@@ -49,6 +49,8 @@ def expect(test):
         "#Time..ms.,Stress..MPa.,Displacement..mm.",
         "Time/ms,Stress/MPa,Displacement/mm",
         "t/ms,nominal stress/N/mm^2,Top displacement /mm",
+        "t [ms],σ [MPa],disp [mm]",
+        "time (ms),|stress| (MPa),displacement (mm)",
     ],
 )
 def test_units_stand_in_the_headers(tmp_path, header):
@@ -350,3 +352,9 @@ def test_a_number_beyond_every_unit_is_refused(tmp_path, largest):
     rows[20] = f"20,{largest},4"
     rows[21] = f"21,{largest.removeprefix('-')},4"
     refused(write(tmp_path, rows=rows), "'stress (MPa)' is up to 1.7e+308", "cannot be a stress")
+
+
+@pytest.mark.parametrize("header", ["Strain%", "ε [%]", "ε/%"])
+def test_a_strain_in_per_cent_may_be_a_letter_or_have_no_blank(tmp_path, header):
+    test = read_test(write(tmp_path, f"time (ms),stress (MPa),{header}"))
+    assert test.displacement.max() / test.specimen.height == pytest.approx(0.04)

@@ -317,14 +317,6 @@ def test_a_slow_record_that_starts_with_a_stress_is_doubted(offset, told):
     assert told in note
 
 
-@pytest.mark.parametrize("size", [1e-18, 1e24])
-def test_a_stress_of_an_absurd_size_is_refused(size):
-    """The limits of a stiffness of 1e-18 Pa were equal for lmfit."""
-    loop = np.sin(np.linspace(0.0, np.pi, 200))
-    with pytest.raises(InputError, match=r"the peak stress is .* is usual .*; check the units"):
-        condition(Record(None, size * loop, 4e-4 * loop), SPECIMEN)
-
-
 def test_an_impact_that_is_mostly_at_its_largest_stress_is_one_contact():
     """Its median was taken for the unloaded level, so that no contact was left."""
     record = impact()

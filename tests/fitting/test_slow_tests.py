@@ -250,3 +250,11 @@ def test_a_displacement_of_picometres_is_no_defect(tmp_path):
     result = ff.fit(ff.read_test(path), starts=1, intervals="local")
     assert result.status == "failed"
     assert "displacement_zero" not in result.parameters
+
+
+def test_a_fit_to_a_stress_of_an_absurd_size_is_refused():
+    """The limits of a stiffness of 1e-18 Pa were equal for lmfit."""
+    loop = np.sin(np.linspace(0.0, np.pi, 120))
+    test = loop_measurement(1e-18 * loop, 1e-3 * loop, SPECIMEN)
+    with pytest.raises(ff.InputError, match=r"cannot be searched between .*; check the units"):
+        ff.fit(test, starts=1, intervals="local")

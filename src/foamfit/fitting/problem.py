@@ -98,6 +98,11 @@ def make_params(
         value = param.start[0] * scales.unit(param.start[1])
         low, high = (bound * scales.unit(param.scale) for bound in param.bounds)
         low *= scales.least(param)
+        if _alike(low, high):
+            wrong = (
+                f"{measurement.name}: {name} cannot be searched between {low:.2g} and {high:.2g}"
+            )
+            raise InputError(f"{wrong} (SI); check the units of the test")
         vary = short != "eta" or (on_striker if spring < 0 else fast and count == 1)
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)

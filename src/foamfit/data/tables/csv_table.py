@@ -194,7 +194,9 @@ def _cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str
 def _header_row(grids: dict[str, list[list[str]]], names: set[str]) -> tuple[str, int] | None:
     """Return separator and index of the row that names most channels, None if none does."""
     best, found = 0, None
-    for separator, grid in grids.items():
+    # On a tie the first separator wins, so those that divide the numbers come first.
+    first = sorted(grids, key=lambda separator: not any(map(_is_sample, grids[separator])))
+    for separator, grid in ((separator, grids[separator]) for separator in first):
         numbers = False
         for i, cells in enumerate(grid):
             # On a tie the last row wins, as titles and instrument settings precede the header.
