@@ -27,8 +27,7 @@ from foamfit.data.measurement import Specimen
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve.simulation import Response, simulate
 from foamfit.springs.chain import DisplacementDrive
-from foamfit.study.identified import Source
-from foamfit.study.population import Population
+from foamfit.study.identified import Population, Source
 
 POINTS = 100  # of a curve in a card
 # A curve ends at the strain END, or where its stress exceeds MOST times the largest stress within

@@ -33,10 +33,9 @@ from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.published import published
 from foamfit.study import gain
-from foamfit.study.draws import known_of
+from foamfit.study.draws import known_of, with_others
 from foamfit.study.gain import Known, Seen, Test
 from foamfit.study.joint_result import JointResult
-from foamfit.study.others import with_others
 from foamfit.study.saved import load, with_record
 from foamfit.text import counted
 

@@ -27,8 +27,7 @@ from foamfit.report import render
 from foamfit.report.folder import Result
 from foamfit.report.studies.prediction import COLOURS, PredictedCurve, Prediction
 from foamfit.springs.parameters import NUISANCE, unit_of
-from foamfit.study.identified import NORMAL, Source, read_source
-from foamfit.study.population import Population
+from foamfit.study.identified import NORMAL, Population, Source, read_source
 from foamfit.text import ASKED
 from foamfit.trust import say
 
