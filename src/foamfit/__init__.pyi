@@ -6,8 +6,8 @@ from .data.csv_file import read_test as read_test
 from .data.measurement import Measurement as Measurement
 from .errors import InputError as InputError, SimulationError as SimulationError
 from .fitting.problem import make_params as make_params
-from .report.studies.plan import Plan as Plan
-from .report.studies.prediction import Prediction as Prediction
+from .report.plan import Plan as Plan
+from .report.prediction import Prediction as Prediction
 from .solve.simulation import Response as Response, simulate as simulate
 from .springs.chain import (
     Chain as Chain,

@@ -17,7 +17,7 @@ from foamfit.one_model import SEARCHED, Options, Progress, identify, judge, part
 from foamfit.options import Keywords, documented
 from foamfit.report.folder import Result, brief, write_result
 from foamfit.report.plots import draw_panel
-from foamfit.report.readable import readable
+from foamfit.report.render import readable
 from foamfit.report.summary import misfit_words, misfits, summary_text
 from foamfit.report.tables import frame
 from foamfit.results import Fit

@@ -2,6 +2,6 @@
 
 `render` fills the sentences in `templates`. `summary` makes the report; `plots` draws its figures,
 and `figures` contains their common layout and style. `folder` keeps results of all kinds,
-`listing` the tables of fits; `comparison` compares results with published ones; `studies` covers
-several tests.
+`listing` the tables of fits; `comparison` compares results with published ones; `plan` and
+`prediction` are the results of these studies.
 """

@@ -24,9 +24,8 @@ from foamfit.parts import ParameterEstimate, law_in_words
 from foamfit.report import figures
 from foamfit.report.figures import TWO
 from foamfit.report.folder import load_result
-from foamfit.report.readable import readable
-from foamfit.report.render import sentences, words
-from foamfit.report.studies.parameters import Panel, plot_parameters
+from foamfit.report.plots import Values, plot_parameters
+from foamfit.report.render import readable, sentences, words
 from foamfit.results import Fit
 from foamfit.springs.laws import law
 from foamfit.springs.laws.record import COMMON, ETA, HEIGHT, RELAXATION_TIME, STRENGTH, Compared
@@ -349,11 +348,11 @@ def plot_comparison(
     ]
     if len(set(tests)) < len(tests):
         tests = [f"{i}: {name}" for i, name in enumerate(tests, start=1)]
-    panels = dict[str, Panel]()
+    panels = dict[str, Values]()
     for test, pair in zip(tests, comparison.pairs, strict=True):
         for row in pair.rows:
             if row.reference and (row.standard_errors is not None or row.lost):
-                one = panels.setdefault(row.label, Panel(row.label, _math(row.label), {}, {}))
+                one = panels.setdefault(row.label, Values(row.label, _math(row.label), {}, {}))
                 one.tests[test] = _drawn(row.fitted, row.unit, row.fitted.state)
                 one.references[test] = _drawn(row.reference, row.unit, comparison.reference)
     title = f"fitted and {comparison.reference} parameters"

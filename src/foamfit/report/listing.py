@@ -22,8 +22,8 @@ from foamfit.parts import ParameterEstimate
 from foamfit.report import figures, tables
 from foamfit.report.figures import tail
 from foamfit.report.folder import load_result
+from foamfit.report.plots import plot_parameters, values_of
 from foamfit.report.render import page, words
-from foamfit.report.studies.parameters import panels_of, plot_parameters
 from foamfit.report.summary import CURVES
 from foamfit.results import Fit
 from foamfit.springs.model import Model
@@ -325,7 +325,7 @@ def write_comparison(
     if not (pictures and found):
         return None
     figure = plot_parameters(
-        f"{title} · {counts_in_words(rows)}", tests, panels_of(tests, found), width=width
+        f"{title} · {counts_in_words(rows)}", tests, values_of(tests, found), width=width
     )
     png, pdf, svg = figures.images(figure, "png", "pdf", "svg")
     write_file(folder / "summary.png", png)

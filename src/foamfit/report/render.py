@@ -1,4 +1,4 @@
-"""Templates of HTML pages and of terminal output."""
+"""Templates of pages and of terminal output, and parameters and numbers in readable form."""
 
 from __future__ import annotations
 
@@ -7,16 +7,24 @@ import json
 import math
 import sys
 from base64 import b64encode
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from foamfit import text
-from foamfit.report.readable import in_unit
+from foamfit.parts import ParameterEstimate
+from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
+from foamfit.text import UNITS, fixed, number, readable_unit, with_error
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+
+# Ratio of two numbers from which each has a unit of its own, if `UNITS` has more than one.
+APART = 1e3
+NOTHING = 1e-4  # a number below this share of another is zero beside it, if units have no prefix
 
 
 @functools.cache
@@ -82,3 +90,118 @@ def _paragraphs(content: str, indent: int = 2) -> str:
 
 def _aligned(rows: Any, **options: Any) -> str:
     return "\n".join(text.aligned(list(rows), **options))
+
+
+@dataclass(frozen=True)
+class Readable:
+    """A parameter in a suitable unit, with numbers rounded to its uncertainty."""
+
+    name: str
+    symbol: tuple[str, str]  # symbol and index
+    value: str
+    stderr: str
+    interval: str
+    unit: str
+    state: str
+    why: str
+    method: str = ""
+    range: str = ""
+    systematic: str = ""
+
+    @property
+    def label(self) -> str:
+        """The name in reports; for parameters of springs, the name in fit.json."""
+        return NUISANCE[self.name].what if self.name in NUISANCE else self.name
+
+    @property
+    def with_error(self) -> str:
+        """The value with its standard error, if there is one."""
+        return f"{self.value} ± {self.stderr}" if self.stderr else self.value
+
+    def with_unit(self, number: str) -> str:
+        """Append the unit, if there is one, to a number of this parameter that has none."""
+        own = not number or number[-1].isalpha()
+        return number if own else f"{number} {self.unit}".removesuffix(" –")
+
+    @property
+    def told(self) -> str:
+        """Name, value, standard error and unit."""
+        return f"{self.label} {self.with_unit(self.with_error)}"
+
+    @property
+    def tied(self) -> bool:
+        """Whether an expression of other parameters gives the value."""
+        return self.state == "fixed" and self.why.startswith("tied by")
+
+    @property
+    def matters(self) -> bool:
+        """Whether the reason is worth showing: not determined, or a remark after a semicolon."""
+        return self.state != "fixed" and (self.state != "determined" or ";" in self.why)
+
+
+def readable(name: str, p: ParameterEstimate, given: tuple[float, str] | None = None) -> Readable:
+    """Return a parameter in readable form, in a given unit (factor and name) or a suitable one.
+
+    Numbers are rounded to two digits of the standard error; without one, to four digits.
+    """
+    half = abs(p.ci95[1] - p.ci95[0]) / 2.0 if p.ci95 else 0.0
+    sizes = [abs(p.value), p.stderr or 0.0, half]  # the value may be far below its error
+    factor, unit = given or readable_unit(max(filter(math.isfinite, sizes), default=0.0), p.unit)
+    value = p.value / factor
+    shown, stderr, interval = number(value), "", ""
+    if math.isfinite(value) and p.stderr is not None and 0 < p.stderr < math.inf:
+        shown, stderr, places = with_error(value, p.stderr / factor)
+        if p.ci95 is not None:
+            interval = " to ".join(fixed(bound / factor, places) for bound in p.ci95)
+    span = "" if p.range is None else _span(p.range, p.unit, factor)
+    least = NOTHING * max(sizes)  # what is less comes from rounding
+    scale = f"{p.systematic / factor:.2g}" if p.systematic and p.systematic > least else ""
+    rest = (p.state, p.why, p.ci95_method or "", span, scale)
+    return Readable(name, symbol(name), shown, stderr, interval, unit or "–", *rest)
+
+
+def _span(ends: tuple[float, float], unit: str, factor: float) -> str:
+    """Write the ends of a range with two digits, or more in a narrow one.
+
+    Both are in the unit of the `factor`, unless they lie decades apart or far above it.
+    """
+    least, most = sorted(map(abs, ends))
+    width = ends[1] - ends[0]
+    digits = 2 + (math.floor(math.log10(most / width)) if 0.0 < 10.0 * width < most else 0)
+    if UNITS.get(unit, [])[1:] and (0.0 < APART * least <= most or most >= 10.0 * APART * factor):
+        return in_unit(ends, unit, digits)
+    seen = (end / factor if abs(end) > NOTHING * most else 0.0 for end in ends)
+    return " to ".join(_few(end, digits) for end in seen)
+
+
+def own_name(name: str, model: str) -> str:
+    """Return the name of a parameter, without the spring if there is only one."""
+    return name if "+" in model else name.removeprefix("s1_")
+
+
+def in_unit(values: Sequence[float], unit: str, digits: int = 4) -> str:
+    """Format one value, or the ends of an interval, in a suitable unit.
+
+    Ends that lie decades apart have a unit each: "17 kPa to 170 GPa".
+    """
+    sizes = [abs(value) for value in values if value]
+    if UNITS.get(unit, [])[1:] and sizes and max(sizes) >= APART * min(sizes):
+        return " to ".join(in_unit([value], unit, digits) for value in values)
+    factor, name = readable_unit(max(sizes, default=0.0), unit)
+    return f"{' to '.join(_few(value / factor, digits) for value in values)} {name}".rstrip()
+
+
+def _few(value: float, digits: int) -> str:
+    return number(float(f"{value:.{digits}g}"), digits)
+
+
+def symbol(name: str) -> tuple[str, str]:
+    """Return the symbol of a parameter and its index: k and "c,2" for s2_kc."""
+    spring, short = split_name(name)
+    if name in NUISANCE:
+        return NUISANCE[name].symbol
+    if spring < 0:
+        return ("η", "site") if name == "site_eta" else (name, "")
+    stem, index = any_param(short).symbol
+    term = short.removeprefix(family(short))  # number of the relaxation term
+    return stem, ",".join(filter(None, (index, term, str(spring + 1))))

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import re
 import unicodedata
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from foamfit.codec import plain
 from foamfit.parts import ParameterEstimate
-from foamfit.report.readable import readable, symbol
-from foamfit.report.render import environment
+from foamfit.report.render import environment, readable, symbol
 from foamfit.springs.parameters import NUISANCE, split_name, springs_first
 from foamfit.text import readable_unit
 
@@ -68,7 +66,7 @@ def parameters_tex(parameters: Parameters, **more: Any) -> str:
     `more` may contain `kinds` and `between` of a joint fit, by the name of the parameter.
     """
     shown = {n: p for n, p in parameters.items() if p.state != "fixed" or p.value}
-    rows = list(zip(symbols(shown), itertools.starmap(readable, shown.items()), strict=True))
+    rows = [(own, readable(name, shown[name])) for name, own in symbols(shown).items()]
     return _tex("parameters", rows=rows, **({"kinds": {}, "between": {}} | more))
 
 
@@ -114,10 +112,10 @@ def wide(each: Sequence[Parameters]) -> Iterator[dict[str, Any]]:
 def by_test(tests: Sequence[str], parameters: ByTest) -> dict[str, Any]:
     """Return heads and rows of a table with one row per test and one column per parameter."""
     heads, cells = [], []
-    for own, (name, each) in zip(symbols(parameters), parameters.items(), strict=True):
-        factor, unit = unit_of_all(each)
+    for name, own in symbols(parameters).items():
+        factor, unit = unit_of_all(parameters[name])
         heads.append((own, unit))
-        cells.append([one and readable(name, one, (factor, unit)) for one in each])
+        cells.append([one and readable(name, one, (factor, unit)) for one in parameters[name]])
     return {"heads": heads, "rows": list(zip(tests, *cells, strict=True))}
 
 
@@ -126,14 +124,12 @@ def by_test_tex(first: str, tests: Sequence[str], parameters: ByTest) -> str:
     return _tex("by_test", first=first, **by_test(tests, parameters))
 
 
-def symbols(names: Iterable[str]) -> list[tuple[str, str]]:
+def symbols(names: Collection[str]) -> dict[str, tuple[str, str]]:
     """Return the symbols of parameters, without the spring if there is only one."""
-    names = list(names)
-    several, found = any(name.startswith("s2_") for name in names), list[tuple[str, str]]()
-    for name in names:
-        stem, index = symbol(name)
-        alone = not several and split_name(name)[0] >= 0
-        found.append((stem, index.rpartition(",")[0] if alone else index))
+    found = {name: symbol(name) for name in names}
+    if not any(name.startswith("s2_") for name in names):
+        alone = {name: pair for name, pair in found.items() if split_name(name)[0] >= 0}
+        found |= {name: (stem, index.rpartition(",")[0]) for name, (stem, index) in alone.items()}
     return found
 
 
@@ -153,7 +149,8 @@ def _tex(name: str, **values: Any) -> str:
 def frame(parameters: Mapping[str, Any], **more: Mapping[str, Any]) -> pd.DataFrame:
     """Return a row for each parameter, in SI; `more` are further columns, by parameter."""
     rows = []
-    for own, (name, p) in zip(symbols(parameters), parameters.items(), strict=True):
+    for name, own in symbols(parameters).items():
+        p = parameters[name]
         row = {"parameter": name, "symbol": formula(own), **numbers_of(p)}
         row |= {key: values.get(name) for key, values in more.items()}
         known = {key: np.nan if one is None else one for key, one in row.items()}

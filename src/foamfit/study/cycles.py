@@ -19,10 +19,8 @@ from foamfit.parts import ParameterEstimate
 from foamfit.report import figures
 from foamfit.report.folder import Result, brief, write_json, write_result, write_table, write_text
 from foamfit.report.listing import REFUSED, Row, row_of, table_rows
-from foamfit.report.plots import draw_loops
-from foamfit.report.readable import own_name
-from foamfit.report.render import words
-from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
+from foamfit.report.plots import Values, draw_loops, plot_parameters, values_of
+from foamfit.report.render import own_name, words
 from foamfit.report.tables import by_test, by_test_tex, frame, stacked, varied
 from foamfit.results import Fit, stamp
 from foamfit.springs.parameters import NUISANCE
@@ -228,12 +226,12 @@ def plot_cycles(found: CycleFits, *, width: str = figures.TWO) -> Figure:
         for number, one in results.items()
         if (loop := one.loop) is not None and loop.label == "strain"
     ]
-    rows, panels = list(found.rows()), list[Panel]()
+    rows, panels = list(found.rows()), list[Values]()
     for title, (column, factor) in BY_CYCLE.items():
         known = {f"cycle {row['cycle']}": row[column] for row in rows if row[column] is not None}
         values = {n: ParameterEstimate(factor * x, state="determined") for n, x in known.items()}
-        panels.append(Panel(column, title, values))
+        panels.append(Values(column, title, values))
     names = [f"cycle {number}" for number in results]
-    panels += panels_of(names, found.varied)
+    panels += values_of(names, found.varied)
     title = f"{found.test} · {found.model}"
     return plot_parameters(title, names, panels, width=width, loops=loops)

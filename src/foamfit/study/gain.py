@@ -26,7 +26,7 @@ from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.branches import unreached
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem, make_params, make_problem
-from foamfit.report.studies.plan import Expected
+from foamfit.report.plan import Expected
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Impact
 from foamfit.springs.parameters import NUISANCE

@@ -21,10 +21,8 @@ from foamfit.parts import OfLaw, ParameterEstimate
 from foamfit.report import figures
 from foamfit.report.folder import Result, brief, write_json, write_result, write_text
 from foamfit.report.listing import Row, table_of
-from foamfit.report.plots import draw_loops
-from foamfit.report.readable import Readable, readable
-from foamfit.report.render import page, sentences, words
-from foamfit.report.studies.parameters import Panel, plot_parameters
+from foamfit.report.plots import Values, draw_loops, plot_parameters
+from foamfit.report.render import Readable, page, readable, sentences, words
 from foamfit.report.tables import MISFITS, formula, frame, parameters_tex, stacked, symbols
 from foamfit.results import Loop, stamp
 from foamfit.springs.model import Model
@@ -242,15 +240,11 @@ def plot_joint(found: JointResult, *, width: str = figures.TWO) -> Figure:
     """
     names, every = _in_order(found), found.loops
     loops = [every[test]._replace(name=name) for test, name in names.items() if test in every]
-    panels = [
-        Panel(
-            name,
-            formula(own),
-            {names[t]: one.in_test(t) for t in names if t in (one.tests or {})},
-            joint=one,
-        )
-        for own, (name, one) in zip(symbols(found.varied), found.varied.items(), strict=True)
-    ]
+    panels = list[Values]()
+    for name, own in symbols(found.varied).items():
+        one = found.parameters[name]
+        each = {names[t]: one.in_test(t) for t in names if t in (one.tests or {})}
+        panels.append(Values(name, formula(own), each, joint=one))
     title = f"{found.name} · {found.law} · {len(names)} tests together"
     return plot_parameters(title, list(names.values()), panels, width=width, loops=loops)
 

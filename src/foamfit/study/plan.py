@@ -28,7 +28,7 @@ from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import make_params, make_problem
 from foamfit.one_model import Progress
 from foamfit.parts import law_in_words
-from foamfit.report.studies.plan import Expected, Outcome, Plan, Quantity
+from foamfit.report.plan import Expected, Outcome, Plan, Quantity
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.published import published

@@ -25,7 +25,7 @@ from foamfit.fitting.search import Tracker, descend
 from foamfit.parts import ParameterEstimate
 from foamfit.report import render
 from foamfit.report.folder import Result
-from foamfit.report.studies.prediction import COLOURS, PredictedCurve, Prediction
+from foamfit.report.prediction import COLOURS, PredictedCurve, Prediction
 from foamfit.springs.parameters import NUISANCE, unit_of
 from foamfit.study.identified import NORMAL, Population, Source, read_source
 from foamfit.text import ASKED

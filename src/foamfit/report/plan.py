@@ -17,8 +17,7 @@ from foamfit.parts import OfLaw
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, TWO, VERMILION
 from foamfit.report.folder import Result, write_json, write_text
-from foamfit.report.readable import own_name
-from foamfit.report.render import page, sentences, words
+from foamfit.report.render import own_name, page, sentences, words
 from foamfit.results import stamp
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import unit_of
