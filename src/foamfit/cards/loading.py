@@ -128,15 +128,12 @@ def curves_at(source: Source, rates: Sequence[float], measured_to: float) -> tup
 
 
 def _reached(source: Source, rates: Sequence[float], measured_to: float) -> tuple[Array, Array]:
-    """Return strains up to the largest that the law reaches, and its stress there at each rate.
-
-    A bistable spring with a negative eps_star ends at a strain below one.
-    """
+    """Return strains up to the largest that the law reaches, and its stress there at each rate."""
     for end in np.linspace(max(END, measured_to), measured_to, _ENDS).tolist():
         fine = np.linspace(0.0, end, _FINE + 1)
         try:
             return fine, np.array([follow(source, r, fine, fine / r).base_stress for r in rates])
-        except SimulationError as error:
+        except SimulationError as error:  # a negative eps_star ends a spring below a strain of one
             ended = error
     raise ended
 
@@ -248,10 +245,7 @@ def unloading_curve(curves: Curves, unloading: Unloading) -> Array:
 def fit_unloading(
     replays: Sequence[Replay], targets: Sequence[Array], *, expon: bool = True
 ) -> Unloading:
-    """Fit the unloading to stresses (Pa) along records; without `expon` the exponent is 1.
-
-    The cost is the mean square of the residuals over the range, summed over the records.
-    """
+    """Fit the unloading to stresses (Pa) over their ranges; without `expon` the exponent is 1."""
     free = slice(None) if expon else slice(2)
     weights = [1.0 / (np.ptp(target) * np.sqrt(target.size)) for target in targets]
 

@@ -180,10 +180,7 @@ def check_target(folder: str | Path, *, of: str | None = None, kept: bool = Fals
 
 
 def check_same(folder: str | Path, data_sha256: str, options: Mapping[str, Any]) -> None:
-    """Raise InputError if `folder` has a result of other data, or made with other options.
-
-    `options` are those of the new result; see `foamfit.results.Fit.options`.
-    """
+    """Raise InputError if `folder` has a result of other data or other options (`Fit.options`)."""
     place = Path(folder).resolve()
     contents = ((name, _content(place / name)) for name in FILES)
     name, content = next(((name, one) for name, one in contents if one), ("", {}))
@@ -267,10 +264,7 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def load_result(folder: str | Path) -> dict[str, Any]:
-    """Return the content of ``fit.json``, given its path or its folder; values are in SI.
-
-    Raises InputError if this version of foamfit cannot read a result there.
-    """
+    """Return the content of ``fit.json`` (SI), by path or folder; InputError if unreadable."""
     path = Path(folder)
     if path.is_dir():
         inside = sorted(str(one.parent) for one in path.glob("*/fit.json"))
@@ -326,13 +320,10 @@ def write_result(result: Fit, folder: Path, *, pages: bool = True, width: str = 
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write an object as JSON; a non-UTF-8 name keeps its bytes as a JSON escape.
-
-    The value of "load", which is not meant for readers, is one line at the end.
-    """
+    """Write an object as JSON; a non-UTF-8 name keeps its bytes as a JSON escape."""
     form: Any = {"ensure_ascii": False, "allow_nan": False}
     text = json.dumps({k: v for k, v in content.items() if k != "load"}, indent=2, **form)
-    if "load" in content:
+    if "load" in content:  # one line at the end, as it is not meant for readers
         text = f'{text[:-2]},\n  "load": {json.dumps(content["load"], **form)}\n}}'
     path.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 

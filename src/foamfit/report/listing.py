@@ -101,10 +101,7 @@ def lines(results: Sequence[Row], top: Path) -> str:
 
 
 def results_in(folder: str | Path) -> list[Row]:
-    """Return the results of fits and joint fits in a folder and below, by place.
-
-    Raises InputError if the folder contains no result.
-    """
+    """Return the fits and joint fits in a folder and below, by place; InputError without any."""
     if not (top := Path(folder)).is_dir():
         raise InputError(f"{folder} is not a folder; foamfit fit TEST.csv writes results to fits/")
     joints = {*top.rglob("joint.json")}
@@ -290,10 +287,7 @@ def _of_springs(rows: Sequence[Row]) -> tables.ByTest:
 
 
 def summary_words(rows: Sequence[Row]) -> str:
-    """Return the text that the command prints for a batch.
-
-    Its table contains median and quartiles over the tests for each varied parameter.
-    """
+    """Return the text that the command prints for a batch, with quartiles of the parameters."""
     wrong, parameters = [row for row in rows if not row.has_fit], list[Any]()
     for name, each in _of_springs([row for row in rows if row.has_fit]).items():
         present = [p for p in each if p is not None]
@@ -312,10 +306,7 @@ def summary_words(rows: Sequence[Row]) -> str:
 def write_comparison(
     rows: Sequence[Row], folder: Path, title: str, *, width: str, pictures: bool
 ) -> bytes | None:
-    """Write the parameters of all tests as summary.tex and, with `pictures`, as figures.
-
-    Return the figure as SVG, if there is one.
-    """
+    """Write the parameters as summary.tex and, with `pictures`, as figures; return that as SVG."""
     fitted = [row for row in rows if row.has_fit]
     tests = [row.test for row in fitted]
     found = _of_springs(fitted)

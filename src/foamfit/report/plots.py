@@ -70,10 +70,7 @@ def plot_fit(result: Fit, *, width: str = TWO) -> Figure:
 
 
 def draw_panel(result: Fit, ax: Axes | None = None, what: str = "stress-strain") -> Axes:
-    """Draw one panel of `plot_fit` into axes or a new figure; return the axes.
-
-    `what` is "stress-strain", "stress-time" or "displacement-time".
-    """
+    """Draw one panel of `plot_fit`, such as "stress-time", into axes or a new figure."""
     panels = {panel.name: panel for panel in panels_of(result)}
     if what not in panels:
         raise InputError(f"what = {what!r} is not admissible; this fit has {', '.join(panels)}")
@@ -211,10 +208,7 @@ def figures_of(result: Fit, width: str = TWO) -> dict[str, Figure]:
 
 
 def plot_profiles(result: Fit) -> Figure | None:
-    """Draw each profile of the cost with its 95 % threshold and interval; None without a profile.
-
-    The dashed parabola is that of the local covariance.
-    """
+    """Draw each profile of the cost with 95 % threshold and interval; None without a profile."""
     panels = list[Panel]()
     for one in result.profiles:
         estimate = result.parameters[one.name]

@@ -144,10 +144,7 @@ class Prediction(Result, OfLaw):
 
     @property
     def by_cycle(self) -> dict[int, dict[str, float]]:
-        """Misfit over the range, and fraction inside the band, of each of several cycles.
-
-        The curve is the stress if the motion is prescribed, otherwise the first curve.
-        """
+        """Misfit over range and fraction inside the band by cycle, of the stress or first curve."""
         curve = self.curves.get("stress_time", next(iter(self.curves.values())))
         return {n: curve.met(part) for n, part in cycles_of(self.measurement).items()}
 
@@ -201,10 +198,7 @@ class Prediction(Result, OfLaw):
 
 
 def plot_prediction(found: Prediction, *, width: str = TWO) -> Figure:
-    """Draw the loop, and each curve with its band and the half width due to each part below.
-
-    For `width` see `plots.plot_fit`.
-    """
+    """Draw the loop, and each curve with its band and below its parts; `width` as in `plot_fit`."""
     inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in found.curves.values())
     about = f"{found.measurement.name}, predicted from {found.source}"
     title = f"{about}; {words('rates', found=found)}", f"inside the 95 % band: {inside}"

@@ -140,15 +140,12 @@ class Readable:
 
 
 def readable(name: str, p: ParameterEstimate, given: tuple[float, str] | None = None) -> Readable:
-    """Return a parameter in readable form, in a given unit (factor and name) or a suitable one.
-
-    Numbers are rounded to two digits of the standard error; without one, to four digits.
-    """
+    """Return a parameter in readable form, in a given unit (factor and name) or a suitable one."""
     half = abs(p.ci95[1] - p.ci95[0]) / 2.0 if p.ci95 else 0.0
     sizes = [abs(p.value), p.stderr or 0.0, half]  # the value may be far below its error
     factor, unit = given or readable_unit(max(filter(math.isfinite, sizes), default=0.0), p.unit)
     value = p.value / factor
-    shown, stderr, interval = number(value), "", ""
+    shown, stderr, interval = number(value), "", ""  # four digits, or two of the standard error
     if math.isfinite(value) and p.stderr is not None and 0 < p.stderr < math.inf:
         shown, stderr, places = with_error(value, p.stderr / factor)
         if p.ci95 is not None:

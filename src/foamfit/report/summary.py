@@ -114,10 +114,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
 
 
 def _screen(result: Fit, rows: list[Readable], values: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines that fit on one screen, or all lines if they are to be `verbose`.
-
-    Of these, states and rows are listed further below.
-    """
+    """Yield the lines that fit on one screen, or all lines if they are to be `verbose`."""
     verbose = values["verbose"]
     head = words("short", part="head", **values).split("\n")
     head = [line for one in head for line in wrapped(one, 2, COLUMNS)[:2]]
@@ -223,10 +220,7 @@ def tables(result: Fit) -> dict[str, list[list[str]]]:
 
 
 def render_report(result: Fit, drawn: Mapping[str, Figure], fit_svg: bytes | None = None) -> str:
-    """Return the report as a self-contained HTML page.
-
-    `drawn` are the figures of `figures_of`, `fit_svg` is that of the fit as SVG, if known.
-    """
+    """Return the report as a self-contained HTML page with the figures of `figures_of`."""
     svg = {} if fit_svg is None else {"fit": fit_svg}
     svg |= {name: images(one, "svg")[0] for name, one in drawn.items() if name not in svg}
     plain, springs, insight = result.to_json_dict(), result.springs, result.insight

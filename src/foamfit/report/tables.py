@@ -61,20 +61,14 @@ def numbers(text: str) -> str:
 
 
 def parameters_tex(parameters: Parameters, **more: Any) -> str:
-    """Return table.tex of a fit, with a row for each parameter that is not fixed at zero.
-
-    `more` may contain `kinds` and `between` of a joint fit, by the name of the parameter.
-    """
+    """Return table.tex of a fit without what is fixed at zero; `more`: `kinds` and `between`."""
     shown = {n: p for n, p in parameters.items() if p.state != "fixed" or p.value}
     rows = [(own, readable(name, shown[name])) for name, own in symbols(shown).items()]
     return _tex("parameters", rows=rows, **({"kinds": {}, "between": {}} | more))
 
 
 def count_determined(parameters: Parameters) -> tuple[int, int]:
-    """Return how many parameters of the springs are determined, and how many have a state.
-
-    Own parameters of a joint fit have none.
-    """
+    """Return how many parameters of the springs are determined, and how many have a state."""
     judged = [p for name, p in parameters.items() if p.vary and p.state and name not in NUISANCE]
     return sum(p.state == "determined" for p in judged), len(judged)
 

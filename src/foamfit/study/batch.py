@@ -329,10 +329,7 @@ def fingerprint(recipe: Recipe, path: Path, toml: Path) -> str:
 
 
 def stored(task: Task) -> tuple[Row, ...] | None:
-    """Return the rows in a test's folder if they have its fingerprint, else None.
-
-    If the recipe includes figures, they must exist and have its width.
-    """
+    """Return the rows in a test's folder if fingerprint and figures are those asked, else None."""
     # There may be no record, or one of another version.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         content = json.loads((task.out / RECORD).read_text(encoding="utf-8"))

@@ -212,10 +212,7 @@ def fit_cycles(
 
 
 def plot_cycles(found: CycleFits, *, width: str = figures.TWO) -> Figure:
-    """Draw the loops in one panel, and start strain, energy, misfit and parameters by cycle.
-
-    See `plot_parameters`.
-    """
+    """Draw all loops, and start strain, energy, misfit and parameters; see `plot_parameters`."""
     results = dict(sorted(found.results.items()))
     loops = [
         loop._replace(

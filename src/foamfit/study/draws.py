@@ -133,14 +133,11 @@ def _held(tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[str])
 
 
 def _of_fits(tests: Sequence[Test], names: Sequence[str]) -> tuple[float, float, Array]:
-    """Return `missed` and `share` of `Known`, and standard errors of each fit over those of JᵀJ.
-
-    A simulated test has neither noise nor model error.
-    """
+    """Return `missed` and `share` of `Known`, and standard errors of each fit over those of JᵀJ."""
     missed, whole, roots = 0.0, 1e-300, np.ones((len(tests), len(names)))
     for t, one in enumerate(tests):
         best, objective = BestPoint(one.problem, one.values), one.problem.objective
-        if one.fit is None:
+        if one.fit is None:  # a simulated test has neither noise nor model error
             continue
         for curve, n, error in zip(objective.counted, objective.sizes, best.errors, strict=True):
             missed, whole = missed + n * error.law**2, whole + n * objective.span(curve) ** 2
@@ -265,10 +262,7 @@ def with_others(known: Known, tests: Sequence[Test], candidate: Candidate, rig: 
 
 
 def _sought(known: Known, drawn: Array, sizes: Array, tests: Sequence[Test]) -> list[Array]:
-    """Return springs that nearly give the records of drawn ones in some tests, nearest first.
-
-    Each differs in another parameter.
-    """
+    """Return springs that nearly give drawn records, nearest first, each with other parameters."""
     links = Links(dict.fromkeys(known.names, "shared"))
     layout = Layout.of(tuple(one.problem for one in tests), links)
     weigh = np.concatenate([one.roots for one in tests])

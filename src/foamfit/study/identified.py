@@ -62,10 +62,7 @@ class Source:
 
 
 def read_source(result: Result | str | Path) -> Source:
-    """Read a result in memory, in a folder, or in its fit.json or joint.json.
-
-    Raises InputError if there is no result, or if it lacks something that a prediction needs.
-    """
+    """Read a result in memory, in a folder or its file; InputError if it lacks what is needed."""
     if isinstance(result, str | Path):
         path, joint = Path(result), Path(result, "joint.json")
         content, where = load_result(joint if joint.is_file() else path), str(result)
@@ -260,10 +257,7 @@ class Population:
 
     @cached_property
     def _open(self) -> tuple[tuple[str, ...], Array]:
-        """Names and covariance of free parameters and slopes, given `held` and the limits.
-
-        Limits are treated as independent measurements with the variance of a flat distribution.
-        """
+        """Names and covariance of free parameters and slopes, given `held` and the limits."""
         free = [name for name in self._uncertain if name not in self.held]
         free += [f"{name}:b" for name, one in self._parameters.items() if one.b_stderr]
         _, at, places = np.intersect1d(free, self.source.names, return_indices=True)
@@ -276,6 +270,7 @@ class Population:
         matrix[np.ix_(at, at)] = inner
         errors = np.array([self._error(name) for name in free])
         matrix = matrix * np.outer(errors, errors)
+        # Limits are like independent measurements with the variance of a flat distribution.
         flat = [self._flat(n, self.limits[n]) if n in self.limits else math.inf for n in free]
         bound = [i for i, sigma in enumerate(flat) if math.isfinite(sigma)]
         prior, rows = [flat[i] ** 2 for i in bound], matrix[bound]

@@ -251,10 +251,7 @@ def _own_fit(test: _Test, model: str, options: Options, near: Sequence[Array]) -
 def evidence(
     fit: Together, names: Sequence[str], kinds: Sequence[str], alone: Together
 ) -> tuple[tuple[Alternative, ...], dict[str, float]]:
-    """Compare these kinds of each of these parameters, leaving the other parameters as they are.
-
-    Also returns the parameters whose slope with rate the tests do not determine, with `open_slope`.
-    """
+    """Compare these kinds of each of these parameters; also return each `open_slope` too wide."""
     found, wide = list[Alternative](), dict[str, float]()
     for name in names:
         present = fit.links.kind(name)

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_NOT_IN_FILE = ("results", "fit")  # fields that joint.json does not contain
 _INPUT = ("velocity", "impulse", "input")  # those about the record, contradictions first
 _OF_A_SEARCH = ("ended", "agree")  # items of the checklist that apply only to a search
 # More than this share of χ², and this multiple of its share of samples, make a test dominant.
@@ -176,7 +175,7 @@ class JointResult(Result, OfLaw):
         write_json(folder / "joint.json", self.to_json_dict())
         shown = self.of_springs
         kinds = {name: one.kind for name, one in shown.items()}
-        between = {name: _between(one) for name, one in shown.items()}
+        between = {name: words("between", one=one) for name, one in shown.items()}
         write_text(folder / "table.tex", parameters_tex(shown, kinds=kinds, between=between))
         for name, one in self.results.items():
             (folder / name).mkdir()
@@ -187,8 +186,8 @@ class JointResult(Result, OfLaw):
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of joint.json: SI units, plain types, null for missing values."""
-        model, names = Model.parse(self.model), (one.name for one in fields(self))
-        shown = {name: getattr(self, name) for name in names if name not in _NOT_IN_FILE}
+        model, names = Model.parse(self.model), [one.name for one in fields(self)]
+        shown = {name: getattr(self, name) for name in names if name not in ("results", "fit")}
         content: dict[str, Any] = plain(stamp() | shown | {"model": model.words, **model.options})
         for one in content["parameters"].values():
             one["state"] = one["state"] or None  # of an own parameter
@@ -203,18 +202,14 @@ def _shown(name: str, one: ParameterEstimate) -> Readable:
     return readable(name, one)
 
 
-def _between(one: ParameterEstimate) -> str:
-    """Return a description of the variation of a parameter between the tests."""
-    return words("between", one=one)
-
-
 def joint_page(found: JointResult, folder: Path, figure: bytes) -> str:
     """Return the page in a folder, with its figure (SVG)."""
     rows = [
         Row(test, misfit=own.misfit, parameters=found.of_test(test), more=_more(found, own))
         for test, own in found.tests.items()
     ]
-    shown = [(one, readable(name, one), _between(one)) for name, one in found.of_springs.items()]
+    every = found.of_springs.items()
+    shown = [(one, readable(name, one), words("between", one=one)) for name, one in every]
     told: dict[str, Any] = {"found": found, "figure": figure, "parameters": shown, "rule": RULE}
     return page("joint", table=table_of(rows, folder), **told)
 
@@ -234,10 +229,7 @@ def _more(found: JointResult, own: JointTest) -> dict[str, Any]:
 
 
 def plot_joint(found: JointResult, *, width: str = figures.TWO) -> Figure:
-    """Draw the loops, and below them the parameters of all tests side by side.
-
-    Tests are sorted by rate if rates differ; see `plot_parameters`.
-    """
+    """Draw the loops, and below them the parameters of all tests; see `plot_parameters`."""
     names, every = _in_order(found), found.loops
     loops = [every[test]._replace(name=name) for test, name in names.items() if test in every]
     panels = list[Values]()
