@@ -298,20 +298,11 @@ def card(
     pairs = zip(records, laws, strict=True)
     targets = [np.where(one.motion > 0.0, law, 0.0) for one, law in pairs]  # cards have no tension
     unloading = loading.fit_unloading(replays, targets, expon=format != "mat057")
-    records = [
-        replace(one, card=replay(unloading)) for one, replay in zip(records, replays, strict=True)
-    ]
+    each = zip(records, replays, strict=True)
+    records = [replace(one, card=replay(unloading)) for one, replay in each]
     densities = [one.density for one in records if one.density is not None]
-    warnings = sentences(
-        "warnings",
-        source=source,
-        format=format,
-        requested=requested,
-        chosen=chosen,
-        crossed=crossed,
-        guessed=loading.guessed(source, curves),
-        density=bool(densities),
-    )
+    told = {"source": source, "format": format, "requested": requested, "chosen": chosen}
+    told |= {"guessed": loading.guessed(source, curves), "density": bool(densities)}
     made = Card(
         name=source.name,
         format=format,
@@ -324,7 +315,7 @@ def card(
             "card": _rms(one.misfit_of_card for one in records),
         },
         density=float(np.mean(densities)) if densities else None,
-        warnings=warnings,
+        warnings=sentences("warnings", crossed=crossed, **told),
         records=tuple(records),
     )
     if out is not None:

@@ -170,9 +170,7 @@ def table_of(results: Sequence[Row], top: Path) -> dict[str, Any]:
     The place of a result that has none is the name of its test. Parameters are shown if all fits
     have the same model.
     """
-    results = [
-        replace(one, place=one.place if one.place.name else top / one.test) for one in results
-    ]
+    results = [one if one.place.name else replace(one, place=top / one.test) for one in results]
     alike = len({one.model for one in results if not one.error}) <= 1
     parameters = tables.varied([one.parameters for one in results if alike])
     found = tables.by_test([one.place.relative_to(top).as_posix() for one in results], parameters)
@@ -310,14 +308,12 @@ def write_comparison(
     fitted = [row for row in rows if row.has_fit]
     tests = [row.test for row in fitted]
     found = _of_springs(fitted)
-    write_file(
-        folder / "summary.tex", tables.by_test_tex("Test", tests, found).encode("utf-8", "replace")
-    )
+    tex = tables.by_test_tex("Test", tests, found)
+    write_file(folder / "summary.tex", tex.encode("utf-8", "replace"))
     if not (pictures and found):
         return None
-    figure = plot_parameters(
-        f"{title} · {counts_in_words(rows)}", tests, values_of(tests, found), width=width
-    )
+    title += f" · {counts_in_words(rows)}"
+    figure = plot_parameters(title, tests, values_of(tests, found), width=width)
     png, pdf, svg = figures.images(figure, "png", "pdf", "svg")
     write_file(folder / "summary.png", png)
     write_file(folder / "summary.pdf", pdf)

@@ -263,17 +263,15 @@ def _map(ax: Axes, plan: Plan) -> None:
     """
     impact, table = bool(plan.rig.masses), plan.table()
     axes = ("velocity", "mass") if impact else ("rate", "strain")
-    best = (
-        table[~table["repeat"].astype(bool)].sort_values("determined").groupby([*axes[::-1]]).last()
-    )
+    single = table[~table["repeat"].astype(bool)]
+    best = single.sort_values("determined").groupby([*axes[::-1]]).last()
     count, risk = best["determined"].unstack(), best["breaks"].unstack()
     x, y = count.columns.astype(float).to_list(), count.index.astype(float).to_list()
     style: Any = {"facecolor": "none", "edgecolor": VERMILION, "hatch": "////", "linewidth": 0.0}
     for row, column in np.argwhere(risk.to_numpy() > RISKY):
         ax.fill_between((column - 0.5, column + 0.5), row - 0.5, row + 0.5, **style)
-    shown = ax.imshow(
-        count, cmap="Blues", vmin=0, vmax=len(plan.now), origin="lower", aspect="auto"
-    )
+    style = {"cmap": "Blues", "vmin": 0, "vmax": len(plan.now), "origin": "lower"}
+    shown = ax.imshow(count, aspect="auto", **style)
     at = plan.advice and [getattr(plan.advice.candidate, name) for name in axes]
     if at and at[0] in x and at[1] in y:
         star: Any = {"color": VERMILION, "ms": 11, "mec": "white", "ls": "none"}

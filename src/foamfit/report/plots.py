@@ -91,20 +91,19 @@ def draw_loops(loops: Iterable[Loop], ax: Axes | None = None) -> Axes:
     import matplotlib
 
     shown = list(loops)
+    named = range(len(shown)) if len(shown) <= MOST_NAMED else (0, len(shown) - 1)
     factor, unit = readable_unit(max((size(one.measured) for one in shown), default=0.0), "Pa")
     colours = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 0.95, max(len(shown), 1)))
     with figures.axes_or_new(ax) as ax:
         for place, (one, colour) in enumerate(zip(shown, colours, strict=False)):
             ax.plot(one.along, one.measured / factor, color="0.75", lw=2.0, label="_measured")
             if one.fitted is not None:
-                named = len(shown) <= MOST_NAMED or place in (0, len(shown) - 1)
-                label = one.name if named else f"_{one.name}"
+                label = one.name if place in named else f"_{one.name}"
                 ax.plot(one.along, one.fitted / factor, color=colour, lw=0.9, label=label)
         ax.set(xlabel=shown[0].label if shown else "strain", ylabel=f"stress ({unit})")
         if shown:
-            ax.legend(
-                loc="best", fontsize="small", title="fitted; measured grey", title_fontsize="small"
-            )
+            about = {"title": "fitted; measured grey", "title_fontsize": "small"}
+            ax.legend(loc="best", fontsize="small", **about)
     return ax
 
 
@@ -192,9 +191,8 @@ def panelled(
         figures.legend_below(figure, figure.axes)
         whole = 72.0 * figure.get_figheight()
         for ax, x, y, span, high in places:
-            ax.set_position(
-                (x / 72.0 / wide, 1.0 - (y + high) / whole, span / 72.0 / wide, high / whole)
-            )
+            box = (x / 72.0 / wide, 1.0 - (y + high) / whole, span / 72.0 / wide, high / whole)
+            ax.set_position(box)
             ax.yaxis.set_label_coords(-ASIDE / span, 0.5)
             ax.xaxis.set_label_coords(0.5, -BENEATH / high)
     return figure
@@ -327,12 +325,11 @@ class Values:
 
 def values_of(tests: Sequence[str], parameters: ByTest) -> list[Values]:
     """Return a panel for each parameter, given its value, or None, in each test."""
-    return [
-        Values(
-            name, formula(own), {t: p for t, p in zip(tests, parameters[name], strict=True) if p}
-        )
-        for name, own in symbols(parameters).items()
-    ]
+    out = list[Values]()
+    for name, own in symbols(parameters).items():
+        known = {t: p for t, p in zip(tests, parameters[name], strict=True) if p is not None}
+        out.append(Values(name, formula(own), known))
+    return out
 
 
 def plot_parameters(

@@ -53,7 +53,8 @@ def environment() -> Environment:
     for name in ("percent", "engineering", "significant", "signed", "number", "field", "warning"):
         made.filters[name] = getattr(text, name)
     made.filters.update(counted=text.counted, listed=text.listed, in_unit=in_unit, exp=math.exp)
-    made.filters.update(paragraphs=_paragraphs, aligned=_aligned)
+    made.filters["paragraphs"] = _paragraphs
+    made.filters["aligned"] = lambda rows, **more: "\n".join(text.aligned(list(rows), **more))
     made.filters["svg"] = lambda svg: "data:image/svg+xml;base64," + b64encode(svg).decode()
     made.filters["quoted"] = functools.partial(json.dumps, ensure_ascii=False)
     made.filters["filename"] = lambda path: Path(path).name
@@ -86,10 +87,6 @@ def _paragraphs(content: str, indent: int = 2) -> str:
     """Wrap each line of a text as a separate paragraph; keep empty lines."""
     lines = (text.wrapped(line, indent) or [""] for line in content.split("\n"))
     return "\n".join(line for paragraph in lines for line in paragraph)
-
-
-def _aligned(rows: Any, **options: Any) -> str:
-    return "\n".join(text.aligned(list(rows), **options))
 
 
 @dataclass(frozen=True)

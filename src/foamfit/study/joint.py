@@ -132,9 +132,8 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
     _check_two(study, len(found), refused)
     tests, every = list[_Test](), _params(study, [test for _, _, test in found])
     for (name, path, test), params in zip(found, every, strict=True):
-        tests.append(
-            _Test(name, path, options.problem(test, study.model, params), loading_rate(test))
-        )
+        problem = options.problem(test, study.model, params)
+        tests.append(_Test(name, path, problem, loading_rate(test)))
     return tests, refused
 
 

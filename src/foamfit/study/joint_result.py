@@ -292,9 +292,8 @@ def result_of(
     others = counted(len(tests) - 1, "other test")
     note = f"Fitted together with {others} ({study.name}): intervals use all of them."
     of_tests, results = dict[str, JointTest](), dict[str, FitResult]()
-    for (name, file), rate, best, share in zip(
-        tests.items(), rates, fit.point.bests, shares.tolist(), strict=True
-    ):
+    every = zip(tests.items(), rates, fit.point.bests, shares.tolist(), strict=True)
+    for (name, file), rate, best, share in every:
         results[name] = one = fit_of_test(best, parameters, name, note, study.seed)
         of_tests[name] = JointTest(
             file=str(file),

@@ -148,9 +148,6 @@ def plan(
     )
 
 
-# ------------------------------------------------------------------ the tests at hand
-
-
 def _as_fitted(tests: Sequence[Test]) -> dict[str, Any]:
     """Return the drives, and the spring parameters held elsewhere than by default, SI."""
     problem, drives = tests[0].problem, {one.problem.objective.drive for one in tests}
@@ -223,9 +220,6 @@ def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
         share, chance = 0.5 * width / size, float(one.state == "determined")
         out[name] = Expected(width, one.state, (width, width), chance, share)
     return out
-
-
-# ------------------------------------------------------------------ the advice
 
 
 def _outcome(known: Known, target: gain.Target | None, one: Candidate, *seen: Seen) -> Outcome:

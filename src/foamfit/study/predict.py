@@ -112,8 +112,8 @@ def predict(
     values, drawn, redrawn = list[Array](), list[dict[str, Array]](), 0
     if population.scattering:
         values, drawn, redrawn = _draw(population, problem, point, draws, seed)
-    halves = {"parameters": _by_parameters(population, aligning, point, tuple(aligned))}
-    halves |= {"motion": _by_motion(problem, point)}
+    by_parameters = _by_parameters(population, aligning, point, tuple(aligned))
+    halves = {"parameters": by_parameters, "motion": _by_motion(problem, point)}
     bands = dict[str, PredictedCurve]()
     for name in objective.counted:
         parts = {part: of_curves[name] for part, of_curves in halves.items() if name in of_curves}
@@ -145,8 +145,8 @@ def predict(
     told |= {"outside": outside, "doubts": _doubts(problem), "nearest": nearest, "enough": enough}
     told |= {"draws": draws, "again": same and later > 1, "least": LEAST_INSIDE}
     told |= {"nuisance": NUISANCE, "unit_of": unit_of}
-    said, warned = (f"predicted_{kind}" for kind in ("sentences", "warnings"))
-    sentences, warnings = render.sentences(said, **told), render.sentences(warned, **told)
+    sentences = render.sentences("predicted_sentences", **told)
+    warnings = render.sentences("predicted_warnings", **told)
     return replace(found, sentences=sentences, warnings=warnings)
 
 
@@ -188,10 +188,8 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
     with suppress(InputError):  # if this record cannot have the time shift of the fitted one
         curves.check_time_shift(measurement, chosen)
         shift = source.time_shift
-    law, terms = source.model.name, source.model.relaxation
-    problem = make_problem(
-        measurement, law, chosen, None, None, inside, time_shift=shift, relaxation=terms
-    )
+    more: Any = {"time_shift": shift, "relaxation": source.model.relaxation}
+    problem = make_problem(measurement, source.model.name, chosen, None, None, inside, **more)
     objective, same = problem.objective, source.sha256 == measurement.data_sha256
     if not same or source.smoothed is None or chosen != "displacement":
         return problem
