@@ -44,9 +44,8 @@ STYLE: Any = {  # matplotlib types its keys one by one
     "svg.hashsalt": "foamfit",  # the same figure gives the same file
 }
 DPI = 250  # of a PNG
-# Width of one and two columns of the Journal of Applied Mechanics, inches.
 TWO = "two"
-COLUMNS = {"one": 3.25, TWO: 7.0}
+COLUMNS = {"one": 3.25, TWO: 7.0}  # widths in the Journal of Applied Mechanics, inches
 NARROWEST, WIDEST = 2.5, 20.0
 UNTITLED = "untitled"  # option after a width and a comma
 LINE = 11.0 / 72.0  # height of a line of a title or a legend, inches

@@ -215,8 +215,7 @@ def write_index(folder: str | Path, results: Sequence[Row]) -> Path | None:
     return path
 
 
-# Status of a test without a result.
-REFUSED, OPEN = "refused", "not fitted"
+REFUSED, OPEN = "refused", "not fitted"  # status of a test without a result
 _STATUS = {
     "ok": "fitted",
     "warnings": "fitted with warnings",

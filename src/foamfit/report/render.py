@@ -22,8 +22,7 @@ from foamfit.text import UNITS, fixed, number, readable_unit, with_error
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-# Ratio of two numbers from which each has a unit of its own, if `UNITS` has more than one.
-APART = 1e3
+APART = 1e3  # ratio of two numbers from which each has a unit of its own, if it has prefixes
 NOTHING = 1e-4  # a number below this share of another is zero beside it, if units have no prefix
 
 

@@ -56,9 +56,8 @@ class Source:
     together: Array
     sha256: str | None  # Of the record of a fit of one test
     smoothed: bool | None  # Whether the drive was the smoothed motion
-    # The number of the last fitted cycle, and `Fit.growth` of several fitted as one history.
-    last_cycle: float | None
-    growth: float
+    last_cycle: float | None  # Number of the last fitted cycle
+    growth: float  # `Fit.growth` of several cycles fitted as one history
 
 
 def read_source(result: Result | str | Path) -> Source:
@@ -215,8 +214,7 @@ class Population:
     source: Source
     specimen: Specimen  # Of the test
     rate: float | None  # Of the test, 1/s; None if unknown
-    # Limits of parameters in a fit of the test.
-    limits: Mapping[str, Pair] = field(default_factory=dict)
+    limits: Mapping[str, Pair] = field(default_factory=dict)  # Of parameters in a fit of the test
 
     def __post_init__(self) -> None:
         """Raise InputError if there is a rate law but no rate."""
@@ -256,8 +254,11 @@ class Population:
         return tuple(n for n in self._uncertain if n not in known and self._span(n) is None)
 
     @cached_property
-    def _open(self) -> tuple[tuple[str, ...], Array]:
-        """Names and covariance of free parameters and slopes, given `held` and the limits."""
+    def covariance(self) -> Array:
+        """Covariance (p, p) of the parameters due to the uncertainty of the result, linearised.
+
+        It is that of the free parameters and slopes, given `held` and the limits.
+        """
         free = [name for name in self._uncertain if name not in self.held]
         free += [f"{name}:b" for name, one in self._parameters.items() if one.b_stderr]
         _, at, places = np.intersect1d(free, self.source.names, return_indices=True)
@@ -275,7 +276,14 @@ class Population:
         bound = [i for i, sigma in enumerate(flat) if math.isfinite(sigma)]
         prior, rows = [flat[i] ** 2 for i in bound], matrix[bound]
         gain = np.linalg.lstsq(rows[:, bound] + np.diag(prior), rows, rcond=None)[0]
-        return tuple(free), matrix - rows.T @ gain
+        matrix = matrix - rows.T @ gain
+        slopes = np.zeros((len(self._parameters), len(free)))
+        for column, name, error in zip(slopes.T, free, errors.tolist(), strict=True):
+            one, step = self._parameters[name.removesuffix(":b")], 1e-4 * error
+            at = (one.b or 0.0) if name.endswith(":b") else one.value
+            sides = [self._vector({name: at + sign * step}) for sign in (-1.0, 1.0)]
+            column[:] = (sides[1] - sides[0]) / (2.0 * step)
+        return slopes @ matrix @ slopes.T
 
     def _error(self, name: str) -> float:
         """Return the standard error of a parameter or slope, SI; by its range if it has none."""
@@ -298,19 +306,6 @@ class Population:
         if low > 0.0 and (is_logarithmic(split_name(name)[1]) or one.kind in ("scatter", *RATES)):
             return abs(one.value) * math.log(high / low) / math.sqrt(12.0)
         return (high - low) / math.sqrt(12.0)
-
-    @cached_property
-    def covariance(self) -> Array:
-        """Covariance (p, p) of the parameters due to the uncertainty of the result, linearised."""
-        free, matrix = self._open
-        slopes = np.zeros((len(self._parameters), len(free)))
-        for column, name in zip(slopes.T, free, strict=True):
-            one = self._parameters[name.removesuffix(":b")]
-            at = (one.b or 0.0) if name.endswith(":b") else one.value
-            step = 1e-4 * self._error(name)
-            sides = [self._vector({name: at + sign * step}) for sign in (-1.0, 1.0)]
-            column[:] = (sides[1] - sides[0]) / (2.0 * step)
-        return slopes @ matrix @ slopes.T
 
     @cached_property
     def quantile(self) -> float:

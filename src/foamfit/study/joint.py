@@ -33,15 +33,12 @@ from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
 from foamfit.trust import covariance, settle
 
-# Number of tests fitted by a full search; the others start at the results of these.
-SEARCHED = 3
+SEARCHED = 3  # tests fitted by a full search; the others start at the results of these
 # A test is searched as well if its reduced χ² exceeds the largest of those by this factor.
 FAR = 2.0
 STEPS = 60  # of a descent from the result of another test
-# Number of tests whose values are tried as start values of the joint fit for all tests.
-ONE_FOR_ALL = 2
-# Rates with a smaller relative difference count as equal.
-SAME_RATE = 0.02
+ONE_FOR_ALL = 2  # tests whose values are tried as start values of the joint fit for all tests
+SAME_RATE = 0.02  # rates with a smaller relative difference count as equal
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,12 +33,10 @@ from foamfit.trust import say
 
 DRAWS = 400  # default number of draws of specimens
 FEWEST = 40  # least number of draws: fewer do not resolve the ends of a 95 % band
-# Factor by which the rate of a test may lie outside the fitted rates.
-RATE_FACTOR = 1.25
+RATE_FACTOR = 1.25  # by which the rate of a test may lie outside the fitted rates
 TRIES = 5  # largest number of attempts per draw
 BAND = (0.025, 0.975)
-# Number of tests that gives no warning; fewer suffice if fewer parameters scatter.
-FEW_TESTS = 5
+FEW_TESTS = 5  # that give no warning; fewer suffice if fewer parameters scatter
 # Least fraction of the samples inside the band that gives no warning. It is below 0.95, as an error
 # of a parameter moves many samples together.
 LEAST_INSIDE = 0.8

@@ -21,8 +21,7 @@ from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import listed
 
-# Kind of a parameter for which the evidence decides between `KINDS`.
-AUTO = "auto"
+AUTO = "auto"  # kind of a parameter for which the evidence decides between `KINDS`
 
 
 def _text(right: str) -> Rule:
@@ -137,8 +136,7 @@ def _parameters(table: Mapping[str, Any], model: Model) -> tuple[dict[str, str],
 
 ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
 WANTED = f"a test is a table that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
-# Stems of tables that list the specimens next to the tests.
-_SPECIMENS = ("specimen", "specimens")
+_SPECIMENS = ("specimen", "specimens")  # stems of tables that list them next to the tests
 _WRITTEN = set[str]().union(*FILES.values())
 
 
