@@ -22,9 +22,8 @@ from foamfit.errors import InputError
 from foamfit.files import csv_bytes, is_left, read_whole, reason, replacing
 from foamfit.report.figures import TWO, inches, write_both
 from foamfit.report.plots import figures_of
-from foamfit.report.render import Readable
+from foamfit.report.render import Readable, numbers_of, parameters_tex, with_head
 from foamfit.report.summary import render_report
-from foamfit.report.tables import numbers_of, parameters_tex, with_head
 from foamfit.results import SCHEMA, Fit
 from foamfit.text import counted, wrapped
 

@@ -19,11 +19,10 @@ from foamfit.codec import build, plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.parts import ParameterEstimate
-from foamfit.report import figures, tables
+from foamfit.report import figures, render
 from foamfit.report.figures import tail
 from foamfit.report.folder import load_result
 from foamfit.report.plots import plot_parameters, values_of
-from foamfit.report.render import page, words
 from foamfit.report.summary import CURVES
 from foamfit.results import Fit
 from foamfit.springs.model import Model
@@ -77,7 +76,7 @@ class Row:
     @property
     def counts(self) -> tuple[int, int]:
         """How many parameters of the springs are determined, and how many have a state."""
-        return tables.count_determined(self.parameters)
+        return render.count_determined(self.parameters)
 
     @property
     def date(self) -> str:
@@ -172,14 +171,14 @@ def table_of(results: Sequence[Row], top: Path) -> dict[str, Any]:
     """
     results = [one if one.place.name else replace(one, place=top / one.test) for one in results]
     alike = len({one.model for one in results if not one.error}) <= 1
-    parameters = tables.varied([one.parameters for one in results if alike])
-    found = tables.by_test([one.place.relative_to(top).as_posix() for one in results], parameters)
+    parameters = render.varied([one.parameters for one in results if alike])
+    found = render.by_test([one.place.relative_to(top).as_posix() for one in results], parameters)
     loops = [small_loop(one.place / "curves.csv") for one in results]
     misfits = {name for one in results for name, x in one.misfit.items() if x is not None}
     return {
         "rows": list(zip(results, loops, ((at, p) for at, *p in found["rows"]), strict=True)),
         "heads": found["heads"],
-        "misfits": {curve: name for curve, name in tables.MISFITS.items() if curve in misfits},
+        "misfits": {curve: name for curve, name in render.MISFITS.items() if curve in misfits},
         "more": list(dict.fromkeys(name for one in results for name in one.more)),
         "models": not alike,
         "options": any(one.options for one in results),
@@ -194,7 +193,7 @@ def table_of(results: Sequence[Row], top: Path) -> dict[str, Any]:
 def index_page(results: Sequence[Row], top: Path, title: str, counts: str, **more: Any) -> bytes:
     """Return the page of a table of fits; `more` may have a picture and a CSV."""
     given = {"picture": None, "csv": "", "mark": MARK.decode()} | more
-    text = page("index", title=title, counts=counts, table=table_of(results, top), **given)
+    text = render.page("index", title=title, counts=counts, table=table_of(results, top), **given)
     return text.encode("utf-8", errors="replace")
 
 
@@ -243,7 +242,7 @@ def table_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
         {name: getattr(row, name) for name in ("test", "file", "status", "error")}
         | {f"misfit_{name}": row.misfit.get(name) for name in CURVES}
         | {"runtime_s": row.runtime_s, **parameters}
-        for row, parameters in zip(rows, tables.wide([row.parameters for row in rows]), strict=True)
+        for row, parameters in zip(rows, render.wide([row.parameters for row in rows]), strict=True)
     ]
 
 
@@ -264,7 +263,7 @@ def read_table(path: Path) -> pd.DataFrame:
 
 def write_summary(rows: Sequence[Row], folder: Path) -> None:
     """Write summary.csv."""
-    write_file(folder / "summary.csv", csv_bytes(tables.with_head(table_rows(rows))))
+    write_file(folder / "summary.csv", csv_bytes(render.with_head(table_rows(rows))))
 
 
 def counts_in_words(rows: Sequence[Row]) -> str:
@@ -277,9 +276,9 @@ def counts_in_words(rows: Sequence[Row]) -> str:
     return f"{total}: {listed(parts)}" if parts else "no test"
 
 
-def _of_springs(rows: Sequence[Row]) -> tables.ByTest:
+def _of_springs(rows: Sequence[Row]) -> render.ByTest:
     """Return the varied parameters of the springs; a median of contact times has no meaning."""
-    every = tables.varied([row.parameters for row in rows])
+    every = render.varied([row.parameters for row in rows])
     return {name: each for name, each in every.items() if name not in NUISANCE}
 
 
@@ -288,10 +287,10 @@ def summary_words(rows: Sequence[Row]) -> str:
     wrong, parameters = [row for row in rows if not row.has_fit], list[Any]()
     for name, each in _of_springs([row for row in rows if row.has_fit]).items():
         present = [p for p in each if p is not None]
-        factor, unit = tables.unit_of_all(present)
+        factor, unit = render.unit_of_all(present)
         quartiles = np.quantile([p.value / factor for p in present], [0.5, 0.25, 0.75]).tolist()
         parameters.append((name, quartiles, unit, [p.state for p in present]))
-    return words(
+    return render.words(
         "batch",
         counts=counts_in_words(rows),
         wrong=wrong[:_MOST_REFUSALS],
@@ -307,7 +306,7 @@ def write_comparison(
     fitted = [row for row in rows if row.has_fit]
     tests = [row.test for row in fitted]
     found = _of_springs(fitted)
-    tex = tables.by_test_tex("Test", tests, found)
+    tex = render.by_test_tex("Test", tests, found)
     write_file(folder / "summary.tex", tex.encode("utf-8", "replace"))
     if not (pictures and found):
         return None

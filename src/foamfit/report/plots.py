@@ -22,7 +22,7 @@ from foamfit.fitting.links import RATES
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, VERMILION
 from foamfit.report.panels import Line, Panel, annotate, draw, draw_below, is_known, panels_of, size
-from foamfit.report.tables import ByTest, formula, symbols, unit_of_all
+from foamfit.report.render import ByTest, formula, symbols, unit_of_all
 from foamfit.terminal import printable
 from foamfit.text import readable_unit
 

@@ -14,10 +14,10 @@ from foamfit.data.measurement import UNITS, Measurement, Striker, interior_chann
 from foamfit.data.zeros import CONTRADICTED
 from foamfit.fitting.branches import covered
 from foamfit.fitting.nuisance import POSITIVE
+from foamfit.report import render
 from foamfit.report.figures import images
 from foamfit.report.plots import origin_word
-from foamfit.report.render import Readable, page, readable, sentences, table, words
-from foamfit.report.tables import count_determined
+from foamfit.report.render import Readable, count_determined, readable, words
 from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import aligned, counted, labelled, percent, warning, wrapped
@@ -54,7 +54,7 @@ def describe(test: Measurement, audit: EnergyAudit) -> str:
         if name != "stress":
             top, size = largest_motion(values, time)
         peaks[name] = size, None if time is None else float(time[top])
-    lines = sentences(
+    lines = render.sentences(
         "described",
         test=test,
         audit=audit,
@@ -214,8 +214,8 @@ def tables(result: Fit) -> dict[str, list[list[str]]]:
     """Return the cells of the tables of cycles and of compared models; [] if there are none."""
     cycles, ladder = result.by_cycle, result.ladder
     return {
-        "cycles": table("by_cycle", found=cycles) if cycles else [],
-        "ladder_rows": table("ladder", ladder=ladder) if ladder else [],
+        "cycles": render.table("by_cycle", found=cycles) if cycles else [],
+        "ladder_rows": render.table("ladder", ladder=ladder) if ladder else [],
     }
 
 
@@ -225,7 +225,7 @@ def render_report(result: Fit, drawn: Mapping[str, Figure], fit_svg: bytes | Non
     svg |= {name: images(one, "svg")[0] for name, one in drawn.items() if name not in svg}
     plain, springs, insight = result.to_json_dict(), result.springs, result.insight
     parts, shares = ((), None) if insight is None else (insight.parts, insight.shares())
-    return page(
+    return render.page(
         "report",
         result=result,
         origin=origin_word(result),

@@ -20,8 +20,7 @@ from foamfit.report import figures
 from foamfit.report.folder import Result, brief, write_json, write_result, write_table, write_text
 from foamfit.report.listing import REFUSED, Row, row_of, table_rows
 from foamfit.report.plots import Values, draw_loops, plot_parameters, values_of
-from foamfit.report.render import own_name, words
-from foamfit.report.tables import by_test, by_test_tex, frame, stacked, varied
+from foamfit.report.render import by_test, by_test_tex, frame, own_name, stacked, varied, words
 from foamfit.results import Fit, stamp
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, percent

@@ -280,8 +280,8 @@ class Population:
         slopes = np.zeros((len(self._parameters), len(free)))
         for column, name, error in zip(slopes.T, free, errors.tolist(), strict=True):
             one, step = self._parameters[name.removesuffix(":b")], 1e-4 * error
-            at = (one.b or 0.0) if name.endswith(":b") else one.value
-            sides = [self._vector({name: at + sign * step}) for sign in (-1.0, 1.0)]
+            value = (one.b or 0.0) if name.endswith(":b") else one.value
+            sides = [self._vector({name: value + sign * step}) for sign in (-1.0, 1.0)]
             column[:] = (sides[1] - sides[0]) / (2.0 * step)
         return slopes @ matrix @ slopes.T
 

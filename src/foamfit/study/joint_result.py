@@ -18,12 +18,11 @@ from foamfit.fitting.links import RATES
 from foamfit.fitting.search import SearchRecord
 from foamfit.fitting.together import Together
 from foamfit.parts import OfLaw, ParameterEstimate
-from foamfit.report import figures
+from foamfit.report import figures, render
 from foamfit.report.folder import Result, brief, write_json, write_result, write_text
 from foamfit.report.listing import Row, table_of
 from foamfit.report.plots import Values, draw_loops, plot_parameters
-from foamfit.report.render import Readable, page, readable, sentences, words
-from foamfit.report.tables import MISFITS, formula, frame, parameters_tex, stacked, symbols
+from foamfit.report.render import MISFITS, Readable, formula, parameters_tex, readable, symbols
 from foamfit.results import Loop, stamp
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
@@ -149,12 +148,12 @@ class JointResult(Result, OfLaw):
         common = {n: p for n, p in self.parameters.items() if p.kind != "own"}
         more = ("kind", "scatter", "b")
         columns = {key: {n: getattr(p, key) for n, p in common.items()} for key in more}
-        frames = {"": frame(common, **columns)}
+        frames = {"": render.frame(common, **columns)}
         for test in self.tests:
             own = self.of_test(test)
             kinds = {name: self.parameters[name].kind for name in own}
-            frames[test] = frame(own, kind=kinds, scatter={}, b={})
-        return stacked(frames, "test")
+            frames[test] = render.frame(own, kind=kinds, scatter={}, b={})
+        return render.stacked(frames, "test")
 
     def __repr__(self) -> str:
         """Return name, model, number of tests, status and the common values."""
@@ -168,14 +167,14 @@ class JointResult(Result, OfLaw):
         known = [one.misfit for one in self.tests.values()]
         curves = [n for n in MISFITS if any(misfit.get(n) is not None for misfit in known)]
         more: Any = {"parameters": every, "nuisance": NUISANCE, "shown": _shown}
-        return words("joint", found=self, most=MOST_ROWS, curves=curves, **more)
+        return render.words("joint", found=self, most=MOST_ROWS, curves=curves, **more)
 
     def write(self, folder: Path, *, pages: bool = True, width: str = figures.TWO) -> None:
         """Write joint.json, its page, its figure, table.tex, and a result folder per test."""
         write_json(folder / "joint.json", self.to_json_dict())
         shown = self.of_springs
         kinds = {name: one.kind for name, one in shown.items()}
-        between = {name: words("between", one=one) for name, one in shown.items()}
+        between = {name: render.words("between", one=one) for name, one in shown.items()}
         write_text(folder / "table.tex", parameters_tex(shown, kinds=kinds, between=between))
         for name, one in self.results.items():
             (folder / name).mkdir()
@@ -209,9 +208,9 @@ def joint_page(found: JointResult, folder: Path, figure: bytes) -> str:
         for test, own in found.tests.items()
     ]
     every = found.of_springs.items()
-    shown = [(one, readable(name, one), words("between", one=one)) for name, one in every]
+    shown = [(one, readable(name, one), render.words("between", one=one)) for name, one in every]
     told: dict[str, Any] = {"found": found, "figure": figure, "parameters": shown, "rule": RULE}
-    return page("joint", table=table_of(rows, folder), **told)
+    return render.page("joint", table=table_of(rows, folder), **told)
 
 
 def _more(found: JointResult, own: JointTest) -> dict[str, Any]:
@@ -223,7 +222,7 @@ def _more(found: JointResult, own: JointTest) -> dict[str, Any]:
         if (level := own.noise.get(curve)) is not None:
             unit = "m" if curve.startswith("displ") else "Pa"
             factor, unit = readable_unit(max(levels), unit)
-            note = words("noise", level=level, factor=factor)
+            note = render.words("noise", level=level, factor=factor)
             out[f"noise {MISFITS[curve]} ({unit})"] = (number(level["sigma"] / factor), note)
     return out
 
@@ -373,9 +372,9 @@ def _with_words(
     told |= {"top": (first, top), "dominant": max(DOMINANT, MORE * top.n_data / fit.found.n_data)}
     told |= {"together": _span_of(fit.found.misfits), "alone": _span_of(alone.misfits)}
     told |= {"n_vary": fit.found.n_vary, "scaled": _scaled(result, fit)}
-    warnings = sentences("joint_warnings", **told)
+    warnings = render.sentences("joint_warnings", **told)
     status = "failed" if lost else "warnings" if warnings else "ok"
-    said = sentences("joint_sentences", **told)
+    said = render.sentences("joint_sentences", **told)
     return replace(result, status=status, warnings=warnings, sentences=said)
 
 

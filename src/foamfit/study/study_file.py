@@ -94,10 +94,8 @@ def read_study(path: str | Path) -> Study:
 
 def _tests(path: Path, content: Mapping[str, Any]) -> tuple[tuple[str, Path, Path | None], ...]:
     """Return tests with their TOML: from [specimens], or else the key specimen."""
-    try:
+    with naming("tests"):
         found = find_tests(content["tests"], path.parent)
-    except InputError as error:
-        raise InputError(f"tests: {error}") from None
     if len(found) < 2:
         why = f"tests names {'one test' if found else 'none'}; a joint fit needs at least two"
         raise InputError(why)
