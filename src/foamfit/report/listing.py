@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import re
-import sys
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -20,24 +19,21 @@ from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.parts import ParameterEstimate
 from foamfit.report import figures, render
-from foamfit.report.figures import tail
 from foamfit.report.folder import load_result
 from foamfit.report.plots import plot_parameters, values_of
 from foamfit.report.summary import CURVES
 from foamfit.results import Fit
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import aligned, counted, listed, option_value, percent
+from foamfit.text import counted, listed, option_value
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
 PAGE, MARK = "index.html", b'<meta name="generator" content="foamfit list">'
-LONGEST = 36  # characters of the name of a test in the terminal
 POINTS = 60  # of each curve of a small loop
 WIDE, TALL = 88, 56  # of a small loop, pixels
-HEAD = ["test", "model", "status", "options", "misfit", "determined", "when", "folder"]
 STRAIN, STRESS = "measured displacement (m)", "measured stress (Pa)"
 FITTED = "stress along measured displacement (Pa)"
 
@@ -83,20 +79,10 @@ class Row:
         """The local time at which it was written."""
         return time.strftime("%Y-%m-%d %H:%M", time.localtime(self.when))
 
-    @property
-    def cells(self) -> list[str]:
-        """The line in the terminal; of the misfits the largest."""
-        known = [misfit for misfit in self.misfit.values() if misfit is not None]
-        found, varied = self.counts
-        cells = [percent(max(known)) if known else "–", f"{found} of {varied}"]
-        rest = [self.error, "", ""] if self.error else [self.options, *cells]
-        return [tail(self.test, LONGEST), self.model, self.status, *rest, self.date]
-
 
 def lines(results: Sequence[Row], top: Path) -> str:
     """Return a line for each result in the folder `top`, below a head."""
-    rows = [HEAD, *([*one.cells, str(one.place.relative_to(top))] for one in results)]
-    return "\n".join(aligned(rows, most=sys.maxsize))
+    return render.words("list", results=results, top=top)
 
 
 def results_in(folder: str | Path) -> list[Row]:

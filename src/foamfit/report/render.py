@@ -21,6 +21,7 @@ import numpy as np
 from foamfit import text
 from foamfit.codec import plain
 from foamfit.parts import ParameterEstimate
+from foamfit.report.figures import tail
 from foamfit.springs.parameters import NUISANCE, any_param, family, split_name, springs_first
 from foamfit.text import UNITS, fixed, number, readable_unit, with_error
 
@@ -61,6 +62,7 @@ def environment() -> Environment:
     made.filters["paragraphs"] = _paragraphs
     made.filters["aligned"] = lambda rows, **more: "\n".join(text.aligned(list(rows), **more))
     made.filters["svg"] = lambda svg: "data:image/svg+xml;base64," + b64encode(svg).decode()
+    made.filters["tail"] = tail
     made.filters["quoted"] = functools.partial(json.dumps, ensure_ascii=False)
     made.filters["filename"] = lambda path: Path(path).name
     made.filters["spoken"] = lambda name: name.replace("_", "-")

@@ -29,6 +29,7 @@ from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, split_name
 
 NORMAL = 1.959964  # half the 95 % interval of a normal distribution, in standard deviations
+Correlation = tuple[tuple[str, ...], Array]  # names and their matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +47,10 @@ class Source:
     rate0: float | None
     parameters: dict[str, ParameterEstimate]  # Of the springs
     errors: dict[str, float]  # Standard errors, also of parameters that are not determined
-    # Names of uncertain parameters and slopes of rate laws ("s1_k0:b"), and their correlation.
-    names: tuple[str, ...]
-    correlation: Array
+    correlation: Correlation  # Of uncertain parameters and slopes of rate laws ("s1_k0:b")
     law_errors: dict[str, float]  # By channel, see `_law_errors`
     time_shift: bool  # Whether a time shift of the motion was fitted
-    # Names of own and scattering parameters, and their correlation between specimens, if known.
-    changing: tuple[str, ...]
-    together: Array
+    specimens: Correlation  # Of own and scattering parameters between specimens, if known
     sha256: str | None  # Of the record of a fit of one test
     smoothed: bool | None  # Whether the drive was the smoothed motion
     last_cycle: float | None  # Number of the last fitted cycle
@@ -92,8 +89,6 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
     errors = dict(zip(local.get("names") or (), local.get("stderr") or (), strict=False))
     errors |= {name: one.stderr for name, one in parameters.items() if one.stderr}
     key = "covariance" if joint else "correlation"
-    names, correlation = _correlation(content, key, "matrix", parameters)
-    changing, together = _correlation(content, "specimens", "correlation", parameters)
     return Source(
         name=str(content.get("name" if joint else "test") or where),
         where=where,
@@ -106,12 +101,10 @@ def _source(content: Mapping[str, Any], where: str) -> Source:
         rate0=content.get("rate0"),
         parameters=parameters,
         errors={name: error for name, error in errors.items() if error},
-        names=names,
-        correlation=correlation,
+        correlation=_correlation(content, key, "matrix", parameters),
         law_errors=_law_errors(tests),
         time_shift=TIME_SHIFT in content["parameters"],
-        changing=changing,
-        together=together,
+        specimens=_correlation(content, "specimens", "correlation", parameters),
         sha256=content.get("data_sha256"),
         smoothed=next((curve.get("motion_smoothed") for curve in noise.values()), None),
         last_cycle=data.get("last_cycle") or data.get("cycle"),
@@ -163,7 +156,7 @@ def _parameter(kind: str, given: Mapping[str, Any]) -> ParameterEstimate:
 
 def _correlation(
     content: Mapping[str, Any], key: str, of: str, parameters: Mapping[str, ParameterEstimate]
-) -> tuple[tuple[str, ...], Array]:
+) -> Correlation:
     """Return the names and the correlation in `content[key][of]`, which may be a covariance."""
     if content.get(key) is None:
         return (), np.empty((0, 0))
@@ -261,9 +254,9 @@ class Population:
         """
         free = [name for name in self._uncertain if name not in self.held]
         free += [f"{name}:b" for name, one in self._parameters.items() if one.b_stderr]
-        _, at, places = np.intersect1d(free, self.source.names, return_indices=True)
-        held = np.intersect1d(self.held, self.source.names, return_indices=True)[2]
-        r, matrix = self.source.correlation, np.eye(len(free))
+        (names, r), matrix = self.source.correlation, np.eye(len(free))
+        _, at, places = np.intersect1d(free, names, return_indices=True)
+        held = np.intersect1d(self.held, names, return_indices=True)[2]
         inner, across = r[np.ix_(places, places)], r[np.ix_(places, held)]
         if held.size:
             inverse = np.linalg.pinv(r[np.ix_(held, held)], hermitian=True)
@@ -334,10 +327,9 @@ class Population:
     @cached_property
     def _correlation(self) -> Array:
         """Correlation of the scattering parameters between specimens."""
-        names = self.scattering
-        out = np.eye(len(names))
-        _, at, places = np.intersect1d(names, self.source.changing, return_indices=True)
-        out[np.ix_(at, at)] = self.source.together[np.ix_(places, places)]
+        (names, known), out = self.source.specimens, np.eye(len(self.scattering))
+        _, at, places = np.intersect1d(self.scattering, names, return_indices=True)
+        out[np.ix_(at, at)] = known[np.ix_(places, places)]
         return out
 
     @property
