@@ -167,11 +167,6 @@ def table_of(results: Sequence[Row], top: Path) -> dict[str, Any]:
         "misfits": {curve: name for curve, name in render.MISFITS.items() if curve in misfits},
         "more": list(dict.fromkeys(name for one in results for name in one.more)),
         "models": not alike,
-        "options": any(one.options for one in results),
-        "states": any(one.status for one in results),
-        "counted": any(one.status and one.counts[1] for one in results),
-        "timed": any(one.runtime_s is not None for one in results),
-        "dated": any(one.when is not None for one in results),
         "size": (WIDE, TALL),
     }
 
