@@ -130,10 +130,7 @@ _LINE = 78  # most characters of a comment
 
 @dataclass(frozen=True, eq=False)
 class Card:
-    """A material card; only its text is in `units`, everything else is in SI.
-
-    `misfit` contains the RMS over the measured range of fit and card, over all tests.
-    """
+    """A material card; only its text is in `units`, everything else is in SI."""
 
     name: str
     format: str
@@ -141,7 +138,7 @@ class Card:
     law: str
     curves: loading.Curves
     unloading: loading.Unloading
-    misfit: dict[str, float | None]
+    misfit: dict[str, float | None]  #: RMS over the measured range of fit and card, over all tests
     density: float | None
     warnings: tuple[str, ...]
     records: tuple[Record, ...]

@@ -42,15 +42,12 @@ _CLOSE = 0.01  # smaller differences of stress, over its range, are ignored
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Loading curves: stress (n_rates, n) in Pa over strain (n,) at strain rates (1/s), ascending.
+    """Loading curves over the strain, one for each strain rate."""
 
-    Beyond the strain `measured_to` they are extrapolated by the law.
-    """
-
-    rates: Array
-    strain: Array
-    stress: Array
-    measured_to: float
+    rates: Array  #: 1/s, ascending
+    strain: Array  #: (n,)
+    stress: Array  #: (n_rates, n), Pa
+    measured_to: float  #: strain beyond which they are extrapolated by the law
 
     @cached_property
     def work(self) -> Array:

@@ -47,17 +47,13 @@ VAGUE = "its standard error is many times its value, so the test does not determ
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity and its reference, in the paper's unit ("s2 k_h+/k0", "" or "k0", "MPa").
-
-    The state of a ratio is the worst of its parts. A published `reference` has no standard error.
-    `remark` is the reason why the two are not compared, or "".
-    """
+    """One quantity and its reference, in the paper's unit ("s2 k_h+/k0", "" or "k0", "MPa")."""
 
     label: str
     unit: str
-    fitted: ParameterEstimate
-    reference: ParameterEstimate | None
-    remark: str
+    fitted: ParameterEstimate  # the state of a ratio is the worst of its parts
+    reference: ParameterEstimate | None  # a published one has no standard error
+    remark: str  # why the two are not compared, or ""
 
     @property
     def lost(self) -> bool:

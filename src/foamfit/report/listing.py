@@ -40,16 +40,13 @@ FITTED = "stress along measured displacement (Pa)"
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a table of fits: a result, or a test of a batch or a joint fit.
-
-    Without a result, `error` says why. `misfit` has the names of fit.json.
-    """
+    """A line of a table of fits: a result, or a test of a batch or a joint fit."""
 
     test: str
     file: str = ""
     status: str = ""
-    error: str | None = None
-    misfit: Mapping[str, float | None] = field(default_factory=dict)
+    error: str | None = None  #: why there is no result
+    misfit: Mapping[str, float | None] = field(default_factory=dict)  #: by the names of fit.json
     runtime_s: float | None = None
     parameters: Mapping[str, ParameterEstimate] = field(default_factory=dict)
     model: str = ""

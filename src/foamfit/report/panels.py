@@ -49,16 +49,13 @@ class Line:
 
 @dataclass(frozen=True)
 class Panel:
-    """Curves in common axes, with name and SI unit of x and of y.
-
-    `below` are curves in a strip below the panel, in % of the measured range: residuals or others.
-    """
+    """Curves in common axes, with name and SI unit of x and of y."""
 
     name: str  # "stress-strain", …
     x: tuple[str, str]
     y: tuple[str, str]
     lines: list[Line]
-    below: list[Line] = field(default_factory=list)
+    below: list[Line] = field(default_factory=list)  # in a strip, in % of the measured range
     below_name: str = "residual"
     title: str = ""
 

@@ -35,18 +35,13 @@ BEST = 12  # rows of the table of tests on the page
 
 @dataclass(frozen=True)
 class Expected:
-    """What is expected of a parameter: 95 % interval and state.
+    """What is expected of a parameter: 95 % interval and state."""
 
-    `ci95_width` is the median width of the interval over the draws (SI; NaN where it is unknown),
-    and `ci95_width_10_90` their 10 and 90 % quantiles. `share` is half of it, not cut at limits,
-    over the scale of the parameter, and `probability` that with which the parameter is determined.
-    """
-
-    ci95_width: float
+    ci95_width: float  #: median width of the interval over the draws, SI; NaN where it is unknown
     state: str
-    ci95_width_10_90: tuple[float, float]
-    probability: float
-    share: float
+    ci95_width_10_90: tuple[float, float]  #: 10 and 90 % quantiles of the widths
+    probability: float  #: with which the parameter is determined
+    share: float  #: half the median width, not cut at limits, over the scale of the parameter
 
 
 @dataclass(frozen=True, eq=False)

@@ -293,16 +293,13 @@ def _draw_strip(ax: Axes, result: Fit, overall: Array, at: list[int]) -> None:
 
 @dataclass(frozen=True)
 class Values:
-    """One parameter of several tests, and the values it is compared with.
-
-    `references` are other values by test, `joint` is the parameter in a joint fit of the tests.
-    """
+    """One parameter of several tests, and the values it is compared with."""
 
     name: str
     head: str  # symbol
     tests: dict[str, ParameterEstimate]
-    references: dict[str, ParameterEstimate] = field(default_factory=dict)
-    joint: ParameterEstimate | None = None
+    references: dict[str, ParameterEstimate] = field(default_factory=dict)  # other ones, by test
+    joint: ParameterEstimate | None = None  # in a joint fit of the tests
 
     @property
     def common(self) -> ParameterEstimate | None:

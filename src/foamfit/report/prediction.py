@@ -42,10 +42,7 @@ BAND: tuple[str, dict[str, Any]] = ("95 % band", {"color": VERMILION, "alpha": 0
 
 @dataclass(frozen=True, eq=False)
 class PredictedCurve:
-    """A curve of a test with its 95 % band, one row per sample, in Pa or m.
-
-    `parts` contains the half width (n,) of the band due to each source of uncertainty alone.
-    """
+    """A curve of a test with its 95 % band, one row per sample, in Pa or m."""
 
     channel: str  # "stress", "displacement", "displacement_1", …
     unit: str
@@ -53,7 +50,7 @@ class PredictedCurve:
     predicted: Array
     lo: Array
     hi: Array
-    parts: dict[str, Array]
+    parts: dict[str, Array]  # Half width (n,) of the band due to each source of uncertainty alone
     kept: NDArray[np.bool_]  # Samples that count: measured ones that are not outliers
 
     @property

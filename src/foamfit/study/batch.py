@@ -270,15 +270,11 @@ def _checked(model: str, options: Options) -> str:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How every test of a batch is fitted.
-
-    `cycles` is one number, several, () for all cycles of a record, or None for the cycle that the
-    TOML names; `options` are keywords of `foamfit.fit`.
-    """
+    """How every test of a batch is fitted."""
 
     model: str
-    options: Mapping[str, Any]
-    cycles: int | tuple[int, ...] | None = None
+    options: Mapping[str, Any]  # keywords of `foamfit.fit`
+    cycles: int | tuple[int, ...] | None = None  # (): all; None: the one that the TOML names
     pages: bool = True
     width: str = TWO  # of the figures
     laws: Mapping[str, str] = field(default_factory=laws.texts)  # texts of the user's law files
@@ -297,18 +293,15 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Task:
-    """One test to be fitted; `out` is the folder to write.
-
-    Relative paths count from `where`. `fingerprint` is that of the files as the caller sees them.
-    """
+    """One test to be fitted."""
 
     name: str
     path: Path
     toml: Path
     recipe: Recipe
-    fingerprint: str
-    out: Path
-    where: Path = field(default_factory=Path.cwd)
+    fingerprint: str  # of the files as the caller sees them
+    out: Path  # folder to write
+    where: Path = field(default_factory=Path.cwd)  # from which relative paths count
 
     def refused(self, why: str) -> tuple[Row, ...]:
         """Return the row of a test without a result."""

@@ -46,15 +46,12 @@ UNITS = {"peak_force": "N", "absorbed_energy": "J", "dissipated_energy": "J", "p
 
 @dataclass(frozen=True, eq=False)
 class Test:
-    """A test at hand or a candidate: its problem and parameters, and the weight of its samples.
-
-    A measured test has its result, and the name of the joint fit that it belongs to.
-    """
+    """A test at hand or a candidate: its problem and parameters, and the weight of its samples."""
 
     problem: Problem
     values: Array
-    fit: FitResult | None = None
-    study: str = ""
+    fit: FitResult | None = None  # of a measured test
+    study: str = ""  # name of the joint fit that it belongs to
     weight: float = 1.0  # samples that the rig records per simulated sample
 
     def with_springs(self, drawn: Array) -> Array:
@@ -90,19 +87,14 @@ class Test:
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """Parameters of the tests at hand that follow them about as well as the best ones.
-
-    `bread` is JᵀJ by the k varied parameters of the springs over their `sizes`, `meat` JᵀΣJ, as
-    slopes may differ much from those of the fit. `others` are springs in series that give nearly
-    the same records.
-    """
+    """Parameters of the tests at hand that follow them about as well as the best ones."""
 
     vectors: tuple[Array, ...]  # of each test
     sizes: Array  # (k,)
-    bread: Array  # (k, k)
-    meat: Array  # (k, k)
+    bread: Array  # (k, k): JᵀJ by the k varied parameters of the springs over their `sizes`
+    meat: Array  # (k, k): JᵀΣJ, as slopes may differ much from those of the fit
     reached: Mask  # (k,): whether the branch of each parameter was reached
-    others: tuple[Other, ...] = ()
+    others: tuple[Other, ...] = ()  # springs in series that give nearly the same records
 
     @property
     def springs(self) -> Array:
@@ -114,21 +106,17 @@ class Draw:
 class Known:
     """What the tests at hand say about the k varied parameters of the springs.
 
-    Of the draws, the first `informed` ones have their own information; the others only tell how
-    probably a limit of the rig is exceeded. `missed` is the sum of squares of the model error,
-    `share` its RMS over the ranges of the curves, `stretch` (k,) the ranges of the fits over those
-    to first order, at least 1. `explained` are vectors with springs in series that explain the
-    tests in other ways, see `draws`.
+    Draws after the first `informed` ones only tell how probably a limit of the rig is exceeded.
     """
 
     problem: Problem
     names: tuple[str, ...]
     drawn: tuple[Draw, ...]
-    informed: int
-    missed: float
-    share: float
-    stretch: Array
-    explained: tuple[Array, ...] = ()
+    informed: int  # number of draws with their own information
+    missed: float  # sum of squares of the model error
+    share: float  # RMS of the model error over the ranges of the curves
+    stretch: Array  # (k,): ranges of the fits over those to first order, at least 1
+    explained: tuple[Array, ...] = ()  # other explanations of the tests by springs in series
 
     @property
     def draws(self) -> tuple[Draw, ...]:

@@ -81,12 +81,7 @@ class Alternative:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JointResult(Result, OfLaw):
-    """The result of a joint fit; the fields are those of joint.json, except the last ones.
-
-    "covariance" is that of shared values, common values of scattering parameters, and for rate laws
-    of the values at `rate0` and the slopes (":b"). "specimens" is the correlation of own and
-    scattering parameters between specimens.
-    """
+    """The result of a joint fit; the fields are those of joint.json, except the last ones."""
 
     _kind = "joint.json"
     name: str  #: Name of the study
@@ -97,7 +92,9 @@ class JointResult(Result, OfLaw):
     drive: str | None = None  #: None if the tests have different drives
     seed: int = 0
     rate0: float | None = None  #: Rate of the median test, 1/s
+    #: Of shared and common values, and for rate laws of values at `rate0` and slopes (":b")
     covariance: dict[str, Any] | None = None
+    #: Correlation of own and scattering parameters between specimens
     specimens: dict[str, Any] | None = None
     evidence: tuple[Alternative, ...] = ()
     statistics: dict[str, float | int] = field(default_factory=dict)

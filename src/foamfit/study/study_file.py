@@ -47,11 +47,7 @@ _KEYS: dict[str, Check] = {
 
 @dataclass(frozen=True)
 class Study:
-    """The content of a study file.
-
-    `kinds` maps parameters to one of `links.KINDS` or "auto"; `held` maps fixed parameters to their
-    values (SI).
-    """
+    """The content of a study file."""
 
     path: Path
     name: str
@@ -59,8 +55,8 @@ class Study:
     model: str
     relaxation: int
     drive: str | None
-    kinds: Mapping[str, str]
-    held: Mapping[str, float]
+    kinds: Mapping[str, str]  # by parameter, one of `links.KINDS` or "auto"
+    held: Mapping[str, float]  # values of fixed parameters, SI
     seed: int = 0
     cycle: int | None = None
     starts: int | None = None
