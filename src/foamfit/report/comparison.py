@@ -258,15 +258,11 @@ def _row(
     label: str,
     one: Compared,
     names: tuple[list[str], list[str]],
-    about: tuple[Side, Side, str],
+    about: tuple[Side, Side, str],  # both sides, and why nothing is compared
     *,
     eta: bool,
 ) -> Iterator[Row]:
-    """Yield the row of a function of the parameters `names` of both sides.
-
-    `about` are both sides and why nothing is compared, or "". A dashpot of zero that no other value
-    stands beside has no row.
-    """
+    """Yield the row of a function of parameters; a dashpot of zero beside no value has none."""
     side, other, nothing = about
     value, reference = (s.evaluate(n, one.formula) for s, n in zip(about[:2], names, strict=True))
     always = not eta or (other.source is not None and one is DAMPING)

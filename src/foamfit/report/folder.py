@@ -291,11 +291,7 @@ def load_result(folder: str | Path) -> dict[str, Any]:
 
 
 def write_result(result: Fit, folder: Path, *, pages: bool = True, width: str = TWO) -> None:
-    """Write all files of a result into an existing folder; report and figures only with `pages`.
-
-    ``profiles.csv`` is written if there are profiles, ``budget.csv`` if the budget contains more
-    than the parameters.
-    """
+    """Write all files of a result into an existing folder; report and figures only with `pages`."""
     write_json(folder / "fit.json", result.to_json_dict())
     texts = ("unit", "state", "why", "ci95_method")
     parameters = (

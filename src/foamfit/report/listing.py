@@ -147,11 +147,7 @@ def small_loop(path: Path) -> tuple[str, ...]:
 
 
 def table_of(results: Sequence[Row], top: Path) -> dict[str, Any]:
-    """Return the values of table.html for results in the folder `top`.
-
-    The place of a result that has none is the name of its test. Parameters are shown if all fits
-    have the same model.
-    """
+    """Return the values of table.html for results in `top`, with parameters if models are alike."""
     results = [one if one.place.name else replace(one, place=top / one.test) for one in results]
     alike = len({one.model for one in results if not one.error}) <= 1
     parameters = render.varied([one.parameters for one in results if alike])

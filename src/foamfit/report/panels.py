@@ -302,10 +302,7 @@ def _place(switch: Switch, result: Fit) -> tuple[float, float, float]:
 
 
 def _points(panel: Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
-    """Yield spring, name, x and y of changes of branch and of half-snapped micro-springs.
-
-    They are in the coordinates of the measured curves, whose zeros may have been fitted.
-    """
+    """Yield spring, name, x and y, as measured, of switches and of half-snapped micro-springs."""
     for switch in result.switches:
         ends, x = (switch.source, switch.target), switch.time
         name = POINTS.get("".join(ends))

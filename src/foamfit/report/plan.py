@@ -251,14 +251,11 @@ def plot_plan(plan: Plan, *, width: str = TWO) -> Figure:
 
 
 def _map(ax: Axes, plan: Plan) -> None:
-    """Draw the expected number of determined parameters against the settings of the tests.
-
-    Of several tests with the same settings the best counts. Tests that exceed a limit with more
-    than 5 % probability are hatched.
-    """
+    """Draw the expected number of determined parameters against the settings of the tests."""
     impact, table = bool(plan.rig.masses), plan.table()
     axes = ("velocity", "mass") if impact else ("rate", "strain")
     single = table[~table["repeat"].astype(bool)]
+    # Of several tests with the same settings the best counts; risky ones are hatched.
     best = single.sort_values("determined").groupby([*axes[::-1]]).last()
     count, risk = best["determined"].unstack(), best["breaks"].unstack()
     x, y = count.columns.astype(float).to_list(), count.index.astype(float).to_list()

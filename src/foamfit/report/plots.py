@@ -240,14 +240,11 @@ def _profile_lines(profile: Profile, stderr: float | None) -> list[Line]:
 
 
 def plot_snapping(result: Fit) -> Figure | None:
-    """Draw the fraction of snapped micro-springs over time, and the chain at a few instants.
-
-    The instants are evenly spaced along the motion of the first cycle. Return None if no fraction
-    is known.
-    """
+    """Draw the snapped fractions over time, and the chain at a few instants; None if unknown."""
     snapping, time, strain = result.snapping, result.curves.time, result.strain
     if not snapping or time is None or strain is None:
         return None
+    # The instants are evenly spaced along the motion of the first cycle.
     first = next(iter(cycles_of(result.measurement).values()), slice(None))
     along = np.cumsum(np.abs(np.diff(strain[first], prepend=strain[0])))
     at = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], INSTANTS))).tolist()

@@ -20,7 +20,7 @@ from foamfit.report import figures
 from foamfit.report.folder import Result, brief, write_json, write_result, write_table, write_text
 from foamfit.report.listing import REFUSED, Row, row_of, table_rows
 from foamfit.report.plots import Values, draw_loops, plot_parameters, values_of
-from foamfit.report.render import by_test, by_test_tex, frame, own_name, stacked, varied, words
+from foamfit.report.render import by_test, by_test_tex, frame, stacked, varied, words
 from foamfit.results import Fit, stamp
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, percent
@@ -102,13 +102,8 @@ class CycleFits(Result):
     def text(self, *, verbose: bool = False) -> str:
         """Return the text that the command prints."""
         shown = self.varied if len(self.varied) <= MOST_NAMES else {}
-        table = by_test([str(number) for number in sorted(self.results)], shown)
-        heads = [
-            f"{own_name(name, self.model)} ({unit})".removesuffix(" ()")
-            for name, (_, unit) in zip(shown, table["heads"], strict=True)
-        ]
-        cells = {cycle: [p.value if p else "–" for p in row] for cycle, *row in table["rows"]}
-        return words("cycles", found=self, heads=heads, cells=cells)
+        numbers = [str(number) for number in sorted(self.results)]
+        return words("cycles", found=self, shown=list(shown), table=by_test(numbers, shown))
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the loops of all cycles, measured and fitted, into axes or a new figure."""

@@ -243,11 +243,7 @@ def _with_open(
 
 
 def with_others(known: Known, tests: Sequence[Test], candidate: Candidate, rig: Rig) -> Known:
-    """Return the same with springs that nearly give the records of each drawn foam.
-
-    They are sought in these tests and a candidate, among the explanations of the tests and springs
-    that have exchanged branches.
-    """
+    """Return the same with springs that nearly give the records of each drawn foam."""
     thin = [replace(one, problem=one.problem.thinned()) for one in tests]
     search, out = [*thin, gain.as_test(known, candidate, rig)], list(known.drawn)
     for i, drawn in enumerate(known.draws):

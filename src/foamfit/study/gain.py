@@ -162,10 +162,7 @@ class Other(NamedTuple):
         return cls(springs[0], np.sum(inner, axis=0), np.asarray(np.any(reached, axis=0)))
 
     def refit(self, known: Known, sizes: Array) -> tuple[Array, float]:
-        """Return the parameters (k,), scaled, after a fit, and the rise of the sum of squares.
-
-        Both are to first order; the steps are small against the scales `sizes` (k,).
-        """
+        """Return scaled parameters (k,) after a fit, to first order, and the rise of χ²."""
         bread, gradient = self.inner[:-1, :-1], self.inner[:-1, -1]
         step = np.linalg.solve(bread + np.eye(gradient.size) / NOTHING**2, gradient)
         rise = max(float(self.inner[-1, -1] - gradient @ step), 0.0)
@@ -310,10 +307,7 @@ def covariance(known: Known, seen: Sequence[Seen], floor: float = TINY) -> tuple
 
 
 def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
-    """Return the expected interval and state of every parameter after some further tests.
-
-    One that may vanish is weak in the draws in which its interval or range would contain zero.
-    """
+    """Return the expected interval and state of every parameter after some further tests."""
     noise, law = (np.diagonal(one, axis1=1, axis2=2) for one in covariance(known, seen))
     halves, ranges = (np.sqrt(np.maximum(one, 0.0)) for one in (NORMAL**2 * noise, law))
     sizes, reached = known.of_draws("sizes"), known.of_draws("reached")
@@ -330,6 +324,7 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
     out = dict[str, Expected]()
     for i, name in enumerate(known.names):
         shown = reached[:, i]
+        # One that may vanish is weak where its interval or range would contain zero.
         sure = ~elsewhere[:, i] & (clear[:, i] if may_vanish(name) else True)
         chance = float(np.mean(shown & (side[:, i] <= WEAK) & sure))
         some = float(np.mean(shown & (wide[:, i] <= NOTHING)))
@@ -346,11 +341,7 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
 def _with_others(
     known: Known, seen: Sequence[Seen], values: Array, halves: Array
 ) -> tuple[Array, Array, Mask]:
-    """Return the ends of intervals, and whether values far outside fit almost as well, (d, k).
-
-    The rule is that of a joint fit (`joint_fit`); intervals extend to other springs that noise
-    could make the best.
-    """
+    """Return the ends of intervals by the rule of `joint_fit`, and where others fit too, (d, k)."""
     low, high, elsewhere = values - halves, values + halves, np.zeros(values.shape, dtype=bool)
     for i, drawn in enumerate(known.draws):
         meat = drawn.meat + sum(one.meat[i] for one in seen)

@@ -175,12 +175,7 @@ def _correlation(
 
 
 def _law_errors(tests: list[Mapping[str, Any]]) -> dict[str, float]:
-    """Return half the 95 % band due to model error by channel, relative to the measured range.
-
-    It is the part of the residuals of the fitted curves that their noise does not explain, RMS over
-    the tests. Residuals that are mostly small but sometimes large are measured by their 95 %
-    quantile.
-    """
+    """Return half the 95 % band due to model error by channel, over the range, RMS of the tests."""
     squares = dict[str, list[float]]()
     for test in tests:
         counted = test.get("noise") or {}  # its keys are the fitted curves
@@ -191,6 +186,7 @@ def _law_errors(tests: list[Mapping[str, Any]]) -> dict[str, float]:
             span = noise.get("range") or math.inf  # the noise is not known
             sigma, most = ((noise.get(key) or 0.0) / span for key in ("sigma", "residual_q95"))
             channel = "stress" if curve.startswith("stress") else curve.removesuffix("_time")
+            # What noise does not explain; residuals that are sometimes large count by a quantile.
             square = max(NORMAL * misfit, most) ** 2 - (NORMAL * sigma) ** 2
             squares.setdefault(channel, []).append(max(square, 0.0))
     return {channel: math.sqrt(sum(each) / len(each)) for channel, each in squares.items()}
@@ -198,11 +194,7 @@ def _law_errors(tests: list[Mapping[str, Any]]) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """The parameters that a result predicts for one test, in the order of the model, SI.
-
-    Their uncertainty is a covariance; those that vary between specimens (kinds "scatter" and "own")
-    are drawn.
-    """
+    """The parameters that a result predicts for a test and its specimens, in the model's order."""
 
     source: Source
     specimen: Specimen  # Of the test
@@ -248,10 +240,7 @@ class Population:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariance (p, p) of the parameters due to the uncertainty of the result, linearised.
-
-        It is that of the free parameters and slopes, given `held` and the limits.
-        """
+        """Covariance (p, p) of the parameters, linearised, SI, given `held` and the limits."""
         free = [name for name in self._uncertain if name not in self.held]
         free += [f"{name}:b" for name, one in self._parameters.items() if one.b_stderr]
         (names, r), matrix = self.source.correlation, np.eye(len(free))
@@ -302,11 +291,8 @@ class Population:
 
     @cached_property
     def quantile(self) -> float:
-        """Ratio of half a 95 % interval to the standard error: the median over the parameters.
-
-        Few degrees of freedom increase it. A limit or a curved valley changes single intervals and
-        hardly affects the median.
-        """
+        """Ratio of half a 95 % interval to the standard error: the median over the parameters."""
+        # Few degrees of freedom increase all; a limit or a curved valley changes single ones.
         ratios = [
             0.5 * (one.ci95[1] - one.ci95[0]) / one.stderr
             for one in map(self._parameters.__getitem__, self._uncertain)
@@ -369,14 +355,10 @@ class Population:
             yield self._vector(dict(zip(own, row.tolist(), strict=True)))
 
     def draws(self, seed: int) -> Iterator[Array]:
-        """Draw parameters of specimens, from their scatter and the uncertainty of the result.
-
-        The scatter is correlated between parameters. Because its size is estimated from n tests, it
-        has Student's t distribution with n - 1 degrees of freedom.
-        """
+        """Draw parameters of specimens, from their scatter and the uncertainty of the result."""
         rng, other = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
         scatter, uncertain = _root(self._correlation), _root(self.covariance)
-        freedom = max(self.fewest - 1, 1)
+        freedom = max(self.fewest - 1, 1)  # of Student's t, as n tests determine the scatter
         while True:
             tail = math.sqrt(freedom / rng.chisquare(freedom))
             drawn = tail * (scatter @ rng.standard_normal(len(self.scattering)))
@@ -388,11 +370,7 @@ class Population:
             yield self._vector(values) + uncertain @ other.standard_normal(len(self._parameters))
 
     def _vector(self, changes: Mapping[str, float]) -> Array:
-        """Return all parameters at the rate and the height of the test.
-
-        `changes` replace common values and, with ":b", slopes of rate laws. The heights of a chain
-        are the specimen's, or else keep their shares of its height.
-        """
+        """Return all parameters at rate and height of the test, with `changes` (slopes: ":b")."""
         values = dict[str, float]()
         for name, one in self._parameters.items():
             value = changes.get(name, one.value)
@@ -400,6 +378,7 @@ class Population:
                 x = math.log(self.rate / self.source.rate0)
                 value *= factor(one.kind, changes.get(f"{name}:b", one.b or 0.0), x)[0]
             values[name] = value
+        # The heights of a chain are the specimen's, or else keep their shares of its height.
         heights = [name for name in self._parameters if name.endswith("_height")]
         if heights and self.specimen.heights is not None:
             values |= dict(zip(heights, self.specimen.heights, strict=True))

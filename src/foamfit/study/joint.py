@@ -201,11 +201,8 @@ def _several(rates: Sequence[float | None]) -> bool:
 def _own_fits(
     study: Study, options: Options, tests: list[_Test], refused: dict[str, str], tell: Progress
 ) -> tuple[list[_Test], Together]:
-    """Return the tests that can be fitted, and the results of their separate fits.
-
-    A few tests, spread over the rates, are fitted by a search; the others descend from the results
-    of these, and are searched too if that gives a much larger misfit.
-    """
+    """Return the tests that can be fitted, and the results of their separate fits."""
+    # A few tests, spread over the rates, are searched; the others descend from their results.
     order = sorted(range(len(tests)), key=lambda t: (tests[t].rate or 0.0, t))
     places = np.unique(np.linspace(0, len(order) - 1, min(SEARCHED, len(order))).astype(int))
     first = [order[place] for place in places]
@@ -262,11 +259,7 @@ def evidence(
 def choose_kinds(
     alone: Together, links: Links, names: list[str], starts: Sequence[Vectors], kinds: list[str]
 ) -> Links:
-    """Return links in which these parameters have the kinds of least BIC.
-
-    All are shared at first; each round makes the change of one kind that lowers BIC most. A rate
-    law is not tried if the tests do not determine its slope (`open_slope`).
-    """
+    """Return links in which these parameters have the kinds of least BIC, from all shared on."""
     best = fit_linked(alone.problems, links.having(**dict.fromkeys(names, "shared")), starts)
     now = None
     while best is not now:
@@ -279,11 +272,7 @@ def choose_kinds(
 def _of_kinds(
     fit: Together, name: str, kinds: Sequence[str], alone: Together
 ) -> tuple[dict[str, Together], float]:
-    """Return fits with each of these kinds of a parameter, and its `open_slope`; 0 if unknown.
-
-    The other parameters keep their kinds. Kinds that cannot be simulated are omitted, and rate laws
-    if the slope is not determined.
-    """
+    """Return fits with each kind of a parameter that the tests allow, and its `open_slope` or 0."""
     present, half, out = fit.links.kind(name), 0.0, dict[str, Together]()
     for kind in sorted({present, *kinds}, key=KINDS.index):
         if kind in RATES and kind != present and half > covariance.WEAK:

@@ -238,10 +238,7 @@ def plot_joint(found: JointResult, *, width: str = figures.TWO) -> Figure:
 
 
 def _in_order(found: JointResult) -> dict[str, str]:
-    """Return the displayed names of the tests; if rates differ, sorted by rate and with the rate.
-
-    Rates differ if a parameter follows a rate law, or by the factor `SEVERAL_RATES`.
-    """
+    """Return the displayed names of the tests; if rates differ, sorted by rate and with it."""
     rates = {test: one.rate or 0.0 for test, one in found.tests.items()}
     law = any(one.kind in RATES for one in found.parameters.values())
     if not law and not 0.0 < SEVERAL_RATES * min(rates.values()) < max(rates.values()):

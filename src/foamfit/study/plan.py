@@ -276,11 +276,7 @@ def _beyond(known: Known, shown: Sequence[dict[str, Expected]], rig: Rig) -> dic
 
 
 def _closing(known: Known, mass: float, rig: Rig) -> tuple[float, float]:
-    """Return the least velocities that reach every branch in half and in 95 % of the draws, m/s.
-
-    With a dashpot a faster striker may leave before the foam has snapped back, so the first of
-    several velocities that reach every branch is refined.
-    """
+    """Return the least velocities that reach every branch in half and in 95 % of the draws, m/s."""
     top = 2.0 * rig.velocity[1]
     speeds = np.geomspace(*rig.velocity, 4).tolist()
     made = [gain.as_test(known, Candidate("impact", mass, speed), rig) for speed in speeds]
@@ -295,6 +291,7 @@ def _closing(known: Known, mass: float, rig: Rig) -> tuple[float, float]:
             return True  # beyond the lock-up
         return bool(test.reached(shown, known.names).all())
 
+    # With a dashpot a faster striker may leave before the foam has snapped back: refine the first.
     tried = np.geomspace(top / SLOWEST, top, SPEEDS).tolist()
     for values in (test.with_springs(one.springs) for one in known.drawn):
         first = next((i for i, speed in enumerate(tried) if closed(speed, values)), None)
