@@ -196,10 +196,7 @@ class Card:
         return "\n".join(sentences("terminal", card=self))
 
     def save(self, path: str | Path) -> Path:
-        """Write the card, PATH.json, PATH.png and PATH.pdf; return the path.
-
-        Raises InputError, before anything is written, if permissions forbid one of the files.
-        """
+        """Write the card, PATH.json, .png and .pdf; InputError first if one cannot be written."""
         path = Path(path)
         files = [path, *(path.with_name(f"{path.name}.{form}") for form in ("json", "png", "pdf"))]
         for one in files:

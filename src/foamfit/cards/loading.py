@@ -17,12 +17,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import least_squares
 from scipy.signal import savgol_filter
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Mask
 from foamfit.data.measurement import Specimen
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve.simulation import Response, simulate
@@ -169,20 +168,17 @@ Replay = Callable[[Unloading], Array]
 
 
 class Motion(NamedTuple):
-    """Strain of a record, its rate (1/s), and whether it is the largest so far (first loading).
-
-    Rate and `first` use the smoothed strain, so that noise neither loads nor unloads.
-    """
+    """Strain of a record, its rate (1/s), and whether it is the largest so far (first loading)."""
 
     strain: Array
     rate: Array
-    first: NDArray[np.bool_]
+    first: Mask
 
     @classmethod
     def of(cls, strain: Array, time: Array) -> Motion:
         """Return the motion of a record in compression; the time is in s."""
         strain = np.maximum(strain, 0.0)
-        window = max(3, int(_WINDOW * strain.size)) | 1
+        window = max(3, int(_WINDOW * strain.size)) | 1  # so that noise neither loads nor unloads
         smooth = savgol_filter(strain, window, 1) if strain.size > window else strain
         return cls(strain, np.gradient(smooth, time), smooth >= np.maximum.accumulate(smooth))
 
@@ -197,12 +193,10 @@ def by_energy(curves: Curves, motion: Motion) -> Replay:
 
 
 def by_slowest(curves: Curves, motion: Motion) -> Replay:
-    """Radioss LAW90: unloading scales the slowest curve, any loading follows the loading curves.
-
-    The energy is integrated along the path.
-    """
+    """Radioss LAW90: unloading scales the slowest curve, any loading follows the loading curves."""
     back = (motion.rate < 0.0) & ~motion.first
     load = curves.at(curves.stress, motion.strain, np.where(back, 0.0, motion.rate))
+    # The energy is integrated along the path.
     work: Array = np.maximum(cumulative_trapezoid(load, motion.strain, initial=0), 0.0)
     energy = np.where(back, _ratio(work, np.maximum.accumulate(work)), 1.0)
     return lambda unloading: unloading.share(energy) * load
@@ -230,11 +224,9 @@ def _ratio(work: Array, most: Array) -> Array:
 
 
 def unloading_curve(curves: Curves, unloading: Unloading) -> Array:
-    """Return the stress (Pa) of unloading from the largest measured strain at the lowest rate.
-
-    Beyond this strain it stays just below the loading curve, which it must not meet.
-    """
+    """Return the stress (Pa) of unloading from the largest measured strain at the lowest rate."""
     most = np.interp(curves.measured_to, curves.strain, curves.work[0])
+    # Beyond this strain it stays just below the loading curve, which it must not meet.
     share = np.minimum(unloading.share(curves.work[0] / most), 0.999)
     return np.asarray(share * curves.stress[0])
 

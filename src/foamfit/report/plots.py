@@ -83,14 +83,11 @@ def draw_panel(result: Fit, ax: Axes | None = None, what: str = "stress-strain")
 
 
 def draw_loops(loops: Iterable[Loop], ax: Axes | None = None) -> Axes:
-    """Draw the loops of several tests into axes or a new figure; return the axes.
-
-    Measured curves are grey and wide, fitted ones thin and coloured from light to dark. If there
-    are many, the legend names only the first and the last.
-    """
+    """Draw loops, measured grey, fitted coloured from light to dark, into axes or a new figure."""
     import matplotlib
 
     shown = list(loops)
+    # Of many loops, the legend names only the first and the last.
     named = range(len(shown)) if len(shown) <= MOST_NAMED else (0, len(shown) - 1)
     factor, unit = readable_unit(max((size(one.measured) for one in shown), default=0.0), "Pa")
     colours = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 0.95, max(len(shown), 1)))

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Mask
 from foamfit.codec import plain
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
@@ -51,7 +50,7 @@ class PredictedCurve:
     lo: Array
     hi: Array
     parts: dict[str, Array]  # Half width (n,) of the band due to each source of uncertainty alone
-    kept: NDArray[np.bool_]  # Samples that count: measured ones that are not outliers
+    kept: Mask  # Samples that count: measured ones that are not outliers
 
     @property
     def range(self) -> float:

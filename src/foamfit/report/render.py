@@ -162,10 +162,7 @@ def readable(name: str, p: ParameterEstimate, given: tuple[float, str] | None = 
 
 
 def _span(ends: tuple[float, float], unit: str, factor: float) -> str:
-    """Write the ends of a range with two digits, or more in a narrow one.
-
-    Both are in the unit of the `factor`, unless they lie decades apart or far above it.
-    """
+    """Write the ends of a range in the unit of `factor`, unless far apart or far above it."""
     least, most = sorted(map(abs, ends))
     width = ends[1] - ends[0]
     digits = 2 + (math.floor(math.log10(most / width)) if 0.0 < 10.0 * width < most else 0)
@@ -181,10 +178,7 @@ def own_name(name: str, model: str) -> str:
 
 
 def in_unit(values: Sequence[float], unit: str, digits: int = 4) -> str:
-    """Format one value, or the ends of an interval, in a suitable unit.
-
-    Ends that lie decades apart have a unit each: "17 kPa to 170 GPa".
-    """
+    """Format a value or the ends of an interval; far apart, each has a unit: "1 kPa to 2 GPa"."""
     sizes = [abs(value) for value in values if value]
     if UNITS.get(unit, [])[1:] and sizes and max(sizes) >= APART * min(sizes):
         return " to ".join(in_unit([value], unit, digits) for value in values)

@@ -206,12 +206,9 @@ def as_test(
     rig: Rig,
     *,
     record: Measurement | None = None,
-    with_motion: bool = False,
+    with_motion: bool = False,  # whether the motion counts even if the rig does not record it
 ) -> Test:
-    """Return a candidate with the law of the tests at hand, or one whose `record` is given.
-
-    With `with_motion` the motion counts even if the rig does not record it.
-    """
+    """Return a candidate with the law of the tests at hand, or one whose `record` is given."""
     problem, test, impact = known.problem, known.problem.measurement, candidate.drive == "impact"
     if record is None:
         timed = _duration_and_peak(known, candidate) if impact else (0.0, problem.scales.stress)
@@ -292,10 +289,7 @@ def look(
 
 
 def covariance(known: Known, seen: Sequence[Seen], floor: float = TINY) -> tuple[Array, Array]:
-    """Return covariances (d, k, k), scaled: due to noise, and of the range due to model error.
-
-    `floor` is the least information on each parameter over its scale.
-    """
+    """Return covariances (d, k, k), scaled: due to noise, and of the range due to model error."""
     bread = known.of_draws("bread") + sum(one.bread for one in seen)
     meat = known.of_draws("meat") + sum(one.meat for one in seen)
     missed = known.missed + sum(one.missed for one in seen) * np.ones(len(bread))

@@ -270,15 +270,11 @@ def result_of(
     tests: Mapping[str, Path],
     rates: Sequence[float | None],
     fit: JointFit,
-    alone: Together,
-    slopes: Mapping[str, float],
-    **about: Any,
+    alone: Together,  # the separate fits
+    slopes: Mapping[str, float],  # those of `joint.evidence`
+    **about: Any,  # further fields of the result
 ) -> JointResult:
-    """Return the result of a joint fit of `tests` (names and files) at these rates (1/s).
-
-    `alone` are the separate fits, and `slopes` those of `joint.evidence`. `about` has further
-    fields of the result.
-    """
+    """Return the result of a joint fit of `tests` (names and files) at these rates (1/s)."""
     found, parameters = fit.found, parameters_of(fit, tuple(tests))
     total = float(np.sum(found.costs))
     shares = np.divide(found.costs, total) if total else np.full(len(tests), 1.0 / len(tests))

@@ -101,14 +101,11 @@ def _cycles(folder: Path) -> CycleFits:
 
 
 def with_record(fit: FitResult, folder: str | Path) -> FitResult:
-    """Return a fit with the path of its record as found from the folder of the result.
-
-    A result names its record as the fit was given it, relative to the current directory of that
-    time, which usually contains the folder.
-    """
+    """Return a fit with the path of its record as found from the folder of the result."""
     path = fit.measurement.path
     if path is None:
         return fit
+    # It is relative to the current directory of the fit, which usually contains the folder.
     places = (place / path for place in Path(folder).resolve().parents)
     path = next((place for place in places if place.is_file()), path)
     return replace(fit, measurement=replace(fit.measurement, path=path))
