@@ -42,6 +42,22 @@ LOOKS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("card", {"color": BLUE, "lw": 1.0, "ls": (0, (5, 1.2))}),
 )
 MOST = 2  # records drawn: the slowest and the fastest
+# File suffix, comment sign and placeholder of an unknown density of each format. The placeholder is
+# an undefined parameter, which the solvers reject.
+FORMATS = {
+    "mat083": (".k", "$", "&RHO"),
+    "mat057": (".k", "$", "&RHO"),
+    "law90": (".rad", "#", "&RHO"),
+    "abaqus": (".inp", "**", "<RHO>"),
+    "csv": (".csv", "#", ""),
+}
+# Mass, length, time and stress of the unit systems.
+UNITS = {
+    "kg-mm-ms": ("kg", "mm", "ms", "GPa"),
+    "t-mm-s": ("t", "mm", "s", "MPa"),
+    "SI": ("kg", "m", "s", "Pa"),
+}
+_LINE = 78  # most characters of a comment
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,24 +124,6 @@ def read_records(result: object) -> list[Record]:
     if isinstance(result, Fit):
         return [Record.of(result)]
     raise InputError(f"a card needs a result of fit or joint, not {result!r}")
-
-
-# File suffix, comment sign and placeholder of an unknown density of each format. The placeholder is
-# an undefined parameter, which the solvers reject.
-FORMATS = {
-    "mat083": (".k", "$", "&RHO"),
-    "mat057": (".k", "$", "&RHO"),
-    "law90": (".rad", "#", "&RHO"),
-    "abaqus": (".inp", "**", "<RHO>"),
-    "csv": (".csv", "#", ""),
-}
-# Mass, length, time and stress of the unit systems.
-UNITS = {
-    "kg-mm-ms": ("kg", "mm", "ms", "GPa"),
-    "t-mm-s": ("t", "mm", "s", "MPa"),
-    "SI": ("kg", "m", "s", "Pa"),
-}
-_LINE = 78  # most characters of a comment
 
 
 @dataclass(frozen=True, eq=False)

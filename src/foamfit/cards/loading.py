@@ -37,6 +37,10 @@ _FINE = 2000  # intervals of the strain from which the points are chosen
 _LEAST_SLOPE = 1e-3  # least slope of a curve over its mean slope within the measured strain
 _SAME = 0.1  # rates that differ by a smaller fraction count as equal
 _CLOSE = 0.01  # smaller differences of stress, over its range, are ignored
+# Bounds and start of HU, SHAPE and EXPON. HU = 0 would switch off the hysteresis.
+_LEAST, _MOST = (1e-3, 0.05, 0.05), (1.0, 50.0, 50.0)
+_START_AT = (0.2, 2.0, 0.9)
+_WINDOW = 0.03  # smoothing window of the strain, as a fraction of the samples of a record
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,12 +146,6 @@ def guessed(source: Source, curves: Curves) -> list[str]:
     changes = {name: slopes[name].base_stress * source.parameters[name].value for name in open_}
     least = _CLOSE * curves.stress.max()
     return [name for name in open_ if np.abs(changes[name]).max() > least]
-
-
-# Bounds and start of HU, SHAPE and EXPON. HU = 0 would switch off the hysteresis.
-_LEAST, _MOST = (1e-3, 0.05, 0.05), (1.0, 50.0, 50.0)
-_START_AT = (0.2, 2.0, 0.9)
-_WINDOW = 0.03  # smoothing window of the strain, as a fraction of the samples of a record
 
 
 class Unloading(NamedTuple):

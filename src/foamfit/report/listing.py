@@ -30,12 +30,20 @@ from foamfit.text import counted, listed, option_value
 if TYPE_CHECKING:
     import pandas as pd
 
-
 PAGE, MARK = "index.html", b'<meta name="generator" content="foamfit list">'
 POINTS = 60  # of each curve of a small loop
 WIDE, TALL = 88, 56  # of a small loop, pixels
 STRAIN, STRESS = "measured displacement (m)", "measured stress (Pa)"
 FITTED = "stress along measured displacement (Pa)"
+REFUSED, OPEN = "refused", "not fitted"  # status of a test without a result
+_STATUS = {
+    "ok": "fitted",
+    "warnings": "fitted with warnings",
+    "failed": "without an acceptable fit",
+    REFUSED: "refused",
+    OPEN: "not fitted yet",
+}
+_MOST_REFUSALS = 20  # named on the terminal
 
 
 @dataclass(frozen=True)
@@ -186,17 +194,6 @@ def write_index(folder: str | Path, results: Sequence[Row]) -> Path | None:
     law = f" · {laws.pop()}" if len(laws) == 1 else ""
     write_file(path, index_page(results, top, str(folder), counted(len(results), "result") + law))
     return path
-
-
-REFUSED, OPEN = "refused", "not fitted"  # status of a test without a result
-_STATUS = {
-    "ok": "fitted",
-    "warnings": "fitted with warnings",
-    "failed": "without an acceptable fit",
-    REFUSED: "refused",
-    OPEN: "not fitted yet",
-}
-_MOST_REFUSALS = 20  # named on the terminal
 
 
 def row_of(test: str, file: str, result: Fit) -> Row:

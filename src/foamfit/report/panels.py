@@ -18,7 +18,6 @@ from foamfit.text import readable_unit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-
 MARKERS = 60  # markers on a measured curve; more would merge
 MANY = 5000  # samples beyond which a curve is stored as pixels, because its outline is too large
 PALE = "#A6CEE3"
@@ -26,12 +25,17 @@ PALE = "#A6CEE3"
 DASHES: Any = ((0, (5, 1.2)), (0, (2.5, 1.2)), (0, (1, 1)), (0, (5, 1.2, 1, 1.2)))
 MARKS = ("^", "v", "D", "p")
 
-
 AXES = {  # name and SI unit of x and y in each panel
     "stress-time": (("time", "s"), ("stress", "Pa")),
     "displacement-time": (("time", "s"), ("displacement", "m")),
     "stress-strain": (("strain", "–"), ("stress", "Pa")),
 }
+# Points at which a spring changes between two branches, in either order.
+POINTS = {"ad": "A1", "da": "A1", "dc": "C1", "ce": "C2", "ec": "C2", "ea": "A2"}
+# Offsets of a name from its point, in typographic points: preferred ones first, then further away.
+SIDES = ((-5.0, 4.0), (5.0, -4.0), (5.0, 4.0), (-5.0, -4.0))
+FARTHER = (1.0, 2.5, 4.0)
+LIGHT = {"a": 0.9, "c": 0.5}  # place of the name along an elastic branch, over its length
 
 
 @dataclass(frozen=True)
@@ -199,14 +203,6 @@ def evenly(x: Array, y: Array, n: int) -> NDArray[np.intp]:
 def size(values: Array) -> float:
     """Return the largest absolute value; 0 without a finite one."""
     return float(np.nanmax(np.abs(values), initial=0.0))
-
-
-# Points at which a spring changes between two branches, in either order.
-POINTS = {"ad": "A1", "da": "A1", "dc": "C1", "ce": "C2", "ec": "C2", "ea": "A2"}
-# Offsets of a name from its point, in typographic points: preferred ones first, then further away.
-SIDES = ((-5.0, 4.0), (5.0, -4.0), (5.0, 4.0), (-5.0, -4.0))
-FARTHER = (1.0, 2.5, 4.0)
-LIGHT = {"a": 0.9, "c": 0.5}  # place of the name along an elastic branch, over its length
 
 
 def annotate(result: Fit, ax: Axes, panel: Panel, size: tuple[float, float]) -> None:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 RISKY = 0.05  # largest probability of exceeding a limit of an advised test
 SHOWN = 3.2  # largest half interval over the scale of a parameter that the figure shows
 BEST = 12  # rows of the table of tests on the page
+SETTINGS = ("drive", "mass", "velocity", "strain", "rate", "cycles", "hold", "interior", "repeat")
 
 
 @dataclass(frozen=True)
@@ -223,9 +224,6 @@ class Plan(Result, OfLaw):
             shown: dict[str, Any] = {"plan": self, "best": ranked[:BEST], "risky": RISKY}
             shown["svg"] = figures.write_both(plot_plan(self, width=width), folder / "plan")
             write_text(folder / "plan.html", page("plan", unit_of=unit_of, **shown))
-
-
-SETTINGS = ("drive", "mass", "velocity", "strain", "rate", "cycles", "hold", "interior", "repeat")
 
 
 def _asked(one: Candidate) -> dict[str, Any]:

@@ -31,6 +31,22 @@ if TYPE_CHECKING:
 
 APART = 1e3  # ratio of two numbers from which each has a unit of its own, if it has prefixes
 NOTHING = 1e-4  # a number below this share of another is zero beside it, if units have no prefix
+_MATH = {"−": "-", "·": r"\cdot ", "±": r"\pm ", "²": "^2", "³": "^3", "µ": r"\mu "}
+_MATH |= {"₀": "_0", "₊": "_+", "₋": "_-"}
+for _letter in "αβγδεζηθκλμνξπρστφχψωΓΔΘΛΞΠΣΦΨΩ":
+    _, _size, _, _name = unicodedata.name(_letter).replace("LAMDA", "LAMBDA").split()
+    _MATH[_letter] = f"\\{_name.lower() if _size == 'SMALL' else _name.capitalize()} "
+_MATH["ε"] = r"\varepsilon "
+_TEXT = {letter: f"${name.strip()}$" for letter, name in _MATH.items()}
+_TEXT |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
+_TEXT |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+_TEXT |= {"–": "--", "…": r"\dots{}"} | {letter: f"${letter}$" for letter in "<>|"}
+_TEXT |= {letter: f"{{{letter}}}" for letter in "[]*"}  # options at the start of a row
+_LAST_LETTER = "ſ"  # last letter that pdfLaTeX sets without further packages
+# Names of the misfits in a table with one row per test.
+MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "w(t)"}
+Parameters = Mapping[str, ParameterEstimate]
+ByTest = Mapping[str, Sequence[ParameterEstimate | None]]
 
 
 @functools.cache
@@ -200,24 +216,6 @@ def symbol(name: str) -> tuple[str, str]:
     stem, index = any_param(short).symbol
     term = short.removeprefix(family(short))  # number of the relaxation term
     return stem, ",".join(filter(None, (index, term, str(spring + 1))))
-
-
-_MATH = {"−": "-", "·": r"\cdot ", "±": r"\pm ", "²": "^2", "³": "^3", "µ": r"\mu "}
-_MATH |= {"₀": "_0", "₊": "_+", "₋": "_-"}
-for _letter in "αβγδεζηθκλμνξπρστφχψωΓΔΘΛΞΠΣΦΨΩ":
-    _, _size, _, _name = unicodedata.name(_letter).replace("LAMDA", "LAMBDA").split()
-    _MATH[_letter] = f"\\{_name.lower() if _size == 'SMALL' else _name.capitalize()} "
-_MATH["ε"] = r"\varepsilon "
-_TEXT = {letter: f"${name.strip()}$" for letter, name in _MATH.items()}
-_TEXT |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
-_TEXT |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-_TEXT |= {"–": "--", "…": r"\dots{}"} | {letter: f"${letter}$" for letter in "<>|"}
-_TEXT |= {letter: f"{{{letter}}}" for letter in "[]*"}  # options at the start of a row
-_LAST_LETTER = "ſ"  # last letter that pdfLaTeX sets without further packages
-# Names of the misfits in a table with one row per test.
-MISFITS = {"stress_strain": "loop", "stress_time": "σ(t)", "displacement_time": "w(t)"}
-Parameters = Mapping[str, ParameterEstimate]
-ByTest = Mapping[str, Sequence[ParameterEstimate | None]]
 
 
 def escaped(text: object) -> str:

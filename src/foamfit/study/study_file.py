@@ -22,6 +22,10 @@ from foamfit.springs.parameters import NUISANCE
 from foamfit.text import listed
 
 AUTO = "auto"  # kind of a parameter for which the evidence decides between `KINDS`
+ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
+WANTED = f"a test is a table that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
+_SPECIMENS = ("specimen", "specimens")  # stems of tables that list them next to the tests
+_WRITTEN = set[str]().union(*FILES.values())
 
 
 def _text(right: str) -> Rule:
@@ -126,12 +130,6 @@ def _parameters(table: Mapping[str, Any], model: Model) -> tuple[dict[str, str],
             why = f"{where} = {value!r} must be one of {wanted}, or a number (SI) to fix it"
             raise InputError(why)
     return kinds, held
-
-
-ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
-WANTED = f"a test is a table that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
-_SPECIMENS = ("specimen", "specimens")  # stems of tables that list them next to the tests
-_WRITTEN = set[str]().union(*FILES.values())
 
 
 def find_tests(
