@@ -75,11 +75,9 @@ class Curves:
 def follow(
     source: Source, rate: float | None, strain: Array, time: Array, names: Sequence[str] = ()
 ) -> Response:
-    """Simulate the law along a strain (over time in s), its parameters being those at `rate` (1/s).
+    """Simulate the law along a strain (over time in s) at `rate` (1/s), with slopes by `names`.
 
-    The response contains the derivatives with respect to the parameters `names`. Raises InputError
-    if the common values of a joint result are not admissible together, SimulationError if the
-    simulation fails.
+    Raises InputError if the common values of a joint result are not admissible together.
     """
     heights = [one.value for name, one in source.parameters.items() if name.endswith("_height")]
     height = sum(heights) or 1.0  # a single spring of any height has the same stress

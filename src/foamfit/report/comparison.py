@@ -328,11 +328,7 @@ def _with_error(p: ParameterEstimate | None) -> str:
 def plot_comparison(
     comparison: Comparison, path: str | Path | None = None, *, width: str = TWO
 ) -> Figure:
-    """Draw fitted values with 95 % intervals, one row per result, and the references as ticks.
-
-    Quantities that are neither compared nor lost (`Row.lost`) are omitted. For `path` and `width`
-    see `plots.plot_response`.
-    """
+    """Draw fitted values with 95 % intervals and references as ticks; see `plots.plot_response`."""
     sources = [pair.other.source for pair in comparison.pairs]
     tests = [
         f"{pair.side.given['test'] if source is None else source.name}, {pair.side.given['drive']}"
@@ -343,6 +339,7 @@ def plot_comparison(
     panels = dict[str, Values]()
     for test, pair in zip(tests, comparison.pairs, strict=True):
         for row in pair.rows:
+            # What is neither compared nor lost is omitted.
             if row.reference and (row.standard_errors is not None or row.lost):
                 one = panels.setdefault(row.label, Values(row.label, _math(row.label), {}, {}))
                 one.tests[test] = _drawn(row.fitted, row.unit, row.fitted.state)

@@ -149,14 +149,10 @@ def panelled(
     width: str,
     *title: str,
     known: bool = False,
-    add: Callable[[Axes, Panel, tuple[float, float]], object] = lambda *_: None,
+    add: Callable[[Axes, Panel, tuple[float, float]], object] = lambda *_: None,  # size in points
 ) -> Figure:
-    """Draw panels with a legend below them.
-
-    The strips of the panels are below them; for a `known` motion the first panel is largest.
-    `add` draws more into a panel of a size in points. Places are given, as finding them from the
-    sizes of all texts takes as long as drawing the figure.
-    """
+    """Draw panels above their strips and a legend; for a `known` motion the first is largest."""
+    # Places are given, as finding them from all texts takes as long as drawing the figure.
     count = max(len(panels), 1)
     wide = min(figures.inches(width), MOST_WIDE[3 if known and count > 1 else min(len(panels), 3)])
     across = figures.abreast(wide, count)

@@ -336,8 +336,7 @@ def stored(task: Task) -> tuple[Row, ...] | None:
 def work(task: Task) -> tuple[Row, ...]:
     """Fit one test, write its folder at once and return its rows; an error becomes a row.
 
-    Raises InputError if the result cannot be written, and RuntimeError on a machine where the test
-    or foamfit is not that of the caller.
+    Raises InputError if it cannot be written, RuntimeError where files or version are others.
     """
     with _ALONE:
         laws.load_texts(task.recipe.laws)

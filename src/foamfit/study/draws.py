@@ -49,11 +49,7 @@ EXPLAINED = 3  # number of explanations that are tried besides exchanges
 def known_of(
     tests: Sequence[Test], rng: np.random.Generator, draws: int, informed: int | None = None
 ) -> Known:
-    """Return what some tests of one foam say about the parameters of its springs.
-
-    The information is computed in the first `informed` draws, by default in all. Without draws
-    only the best point is known.
-    """
+    """Return what some tests of one foam say about its springs; without draws, the best point."""
     first, at_hand = tests[0].problem, [one.values for one in tests]
     names = tuple(name for name in first.free() if name not in NUISANCE)
     missed, share, roots = _of_fits(tests, names)
@@ -97,16 +93,13 @@ def _reached(tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[st
 def _explanations(
     tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[str]
 ) -> list[Together]:
-    """Return springs in series that explain the tests at hand.
-
-    They are the minima that noise could make the best, best first, and the best springs of which
-    one or more stay on their first branches (`Law.fewer`). These follow the tests about as well
-    with fewer parameters, but no search finds them, as more branches also follow the noise.
-    """
+    """Return springs in series that explain the tests at hand, minima first, best first."""
     problems, model = tuple(one.problem for one in tests), tests[0].problem.model
     links, top = Links(dict.fromkeys(names, "shared")), max(one.scales.stress for one in problems)
     layout = Layout.of(problems, links)
     minima = joint_minima(layout.fitted(layout.start(vectors)))
+    # Springs that stay on their first branches (`Law.fewer`) follow the tests about as well with
+    # fewer parameters, but no search finds them, as more branches also follow the noise.
     simpler = dict[tuple[int, ...], Together]()
     for found in minima[:FROM]:
         own = [model.own(i, found.values[0]) for i in range(len(model.laws))]

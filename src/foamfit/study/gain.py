@@ -144,14 +144,11 @@ class Known:
 
 
 class Other(NamedTuple):
-    """Other springs, and what some tests show of their difference from a drawn foam.
-
-    `inner` (k + 1, k + 1) has the products of the slopes by scaled parameters, and of the
-    differences of the residuals as a last column, without nuisance parameters; NaN if a test cannot
-    be simulated. The products of several tests add up.
-    """
+    """Other springs, and what some tests show of their difference from a drawn foam."""
 
     springs: Array
+    # (k + 1, k + 1): products of the slopes by scaled parameters and, as a last column, of the
+    # differences of the residuals; NaN if a test cannot be simulated. Those of tests add up.
     inner: Array
     reached: Mask  # (k,)
 
