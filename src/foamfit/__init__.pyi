@@ -27,10 +27,10 @@ from .springs.laws import (
 from .springs.published import published as published
 from .study.batch import batch as batch
 from .study.cycles import CycleFits as CycleFits, fit_cycles as fit_cycles
+from .study.identified import load as load
 from .study.joint import joint as joint
 from .study.joint_result import JointResult as JointResult
 from .study.plan import plan as plan
 from .study.predict import predict as predict
-from .study.saved import load as load
 
 __version__: str

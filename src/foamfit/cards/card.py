@@ -27,9 +27,8 @@ from foamfit.report.panels import AXES, Line, Panel
 from foamfit.report.plots import panelled
 from foamfit.report.render import environment, sentences
 from foamfit.results import Fit
-from foamfit.study.identified import read_source
+from foamfit.study.identified import load, read_source
 from foamfit.study.joint_result import JointResult
-from foamfit.study.saved import load
 from foamfit.text import percent, significant
 
 if TYPE_CHECKING:

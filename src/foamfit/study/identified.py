@@ -1,35 +1,130 @@
-"""The law and parameters of a result, and those that it predicts for another test and specimens.
+"""A result read from its folder (`load`), and what it predicts for another test and specimens.
 
-A result in memory is read by the content of its file, fit.json or joint.json, so that both give the
-same numbers.
+To predict, a result in memory is read by the content of its file, fit.json or joint.json, so that
+both give the same numbers.
 """
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import lmfit
 import numpy as np
 
+from foamfit.api import FitResult
 from foamfit.arrays import Array
-from foamfit.codec import build
+from foamfit.codec import build, reading
 from foamfit.data.measurement import Specimen
 from foamfit.errors import InputError
+from foamfit.files import read_whole, reason
 from foamfit.fitting.box import is_logarithmic
 from foamfit.fitting.links import KINDS, RATES, factor
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.options import DRIVES
 from foamfit.parts import Pair, ParameterEstimate
-from foamfit.report.folder import Result, load_result
+from foamfit.report.folder import SAMPLES, Result, load_result, read_samples
+from foamfit.report.listing import read_table
+from foamfit.results import KEPT
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, split_name
+from foamfit.study.cycles import CycleFits
+from foamfit.study.joint_result import JointResult
+from foamfit.trust.identifiability import Insight
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 NORMAL = 1.959964  # half the 95 % interval of a normal distribution, in standard deviations
 Correlation = tuple[tuple[str, ...], Array]  # names and their matrix
+
+
+def load(folder: str | Path) -> FitResult | JointResult | CycleFits | pd.DataFrame:
+    """Return the result in the folder of a fit, a joint fit, several cycles or a batch.
+
+    It equals the result that was saved, and saving it again writes the same files. For a batch it
+    is the summary that `foamfit.batch` returns.
+
+    Raises
+    ------
+    InputError
+        If there is no result in the format of this version, or one of its files is damaged.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise InputError(f"{folder} is not a folder; name a result folder of foamfit")
+    if (place / "joint.json").is_file():
+        return _joint(place)
+    if (place / "cycles.json").is_file():
+        return _cycles(place)
+    if (place / "summary.csv").is_file():
+        return read_table(place / "summary.csv")
+    return _fit(place)
+
+
+def _fit(folder: Path) -> FitResult:
+    content = load_result(folder)
+    if not isinstance(content.get("load"), Mapping):
+        raise InputError(
+            f"{folder / 'fit.json'} is of foamfit {content.get('foamfit')}, which did not keep all "
+            "that load needs; fit the test again"
+        )
+    kept = content | content["load"]
+    columns = _columns(folder / "curves.csv", kept.get("samples"))
+    with reading(f"{folder}: fit.json"):
+        kept["measurement"] = content | content["data"] | kept["measurement"]
+        given = {name: kept[name] for name in KEPT if name in kept}
+        result: FitResult = build(FitResult, given, columns, lmfit=lmfit, Insight=Insight)
+    result.draws.update(read_samples(folder / SAMPLES))
+    return result
+
+
+def _columns(path: Path, samples: object) -> dict[str, Array]:
+    """Read curves.csv, which must have `samples` rows."""
+    try:
+        head, *lines = read_whole(path).decode(errors="replace").splitlines() or [""]
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {reason(error)}") from None
+    if len(lines) != samples:
+        raise InputError(f"{path} is damaged: it has {len(lines)} rows of {samples}")
+    names = next(csv.reader([head]), [])
+    try:
+        values = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.empty((0, len(names)))
+        return dict(zip(names, values.T, strict=True))
+    except ValueError as error:
+        raise InputError(f"{path} is damaged: {str(error).partition(';')[0]}") from None
+
+
+def _joint(folder: Path) -> JointResult:
+    content = load_result(folder / "joint.json")
+    with reading(f"{folder / 'joint.json'}"):
+        given = content | {"model": Model.of_result(content).name}
+        made: JointResult = build(JointResult, given | {"results": {}}, {})
+    return replace(made, results={name: _fit(folder / name) for name in made.tests})
+
+
+def _cycles(folder: Path) -> CycleFits:
+    content = load_result(folder / "cycles.json")
+    with reading(f"{folder / 'cycles.json'}"):
+        made: CycleFits = build(CycleFits, content | {"results": {}}, {})
+        names = content["fitted"]
+    return replace(made, results={n: _fit(folder / f"cycle-{n}") for n in names})
+
+
+def with_record(fit: FitResult, folder: str | Path) -> FitResult:
+    """Return a fit with the path of its record as found from the folder of the result."""
+    path = fit.measurement.path
+    if path is None:
+        return fit
+    # It is relative to the current directory of the fit, which usually contains the folder.
+    places = (place / path for place in Path(folder).resolve().parents)
+    path = next((place for place in places if place.is_file()), path)
+    return replace(fit, measurement=replace(fit.measurement, path=path))
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,8 +35,8 @@ from foamfit.springs.published import published
 from foamfit.study import gain
 from foamfit.study.draws import known_of, with_others
 from foamfit.study.gain import Known, Seen, Test
+from foamfit.study.identified import load, with_record
 from foamfit.study.joint_result import JointResult
-from foamfit.study.saved import load, with_record
 from foamfit.text import counted
 
 DRAWS = 40  # number of drawn foams
