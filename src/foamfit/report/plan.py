@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 RISKY = 0.05  # largest probability of exceeding a limit of an advised test
 SHOWN = 3.2  # largest half interval over the scale of a parameter that the figure shows
 BEST = 12  # rows of the table of tests on the page
+# What plan.json says of a candidate, and the name of it in `Outcome`.
+IN_FILE = {"breaks": "breaks", "number_determined": "number", "expected": "expected"}
+IN_FILE |= {"peak_force": "force", "quantity_error": "error", "told_apart": "apart"}
 SETTINGS = ("drive", "mass", "velocity", "strain", "rate", "cycles", "hold", "interior", "repeat")
 
 
@@ -172,38 +175,24 @@ class Plan(Result, OfLaw):
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``plan.json``: SI, plain types, None for missing values."""
-        best = self.advice
+        best, content = self.advice, {**stamp(), "tests": [one.name for one in self.tests]}
+        content |= {key: getattr(self, key) for key in ("model", "relaxation", "seed")}
+        keys = ("determined", "open", "breaks", "expected")
+        content["advice"] = best and _asked(best.candidate) | {
+            key: getattr(best, key) for key in keys
+        }
+        content["now"] = self.now
+        content["candidates"] = [
+            _asked(one.candidate) | {key: getattr(one, name) for key, name in IN_FILE.items()}
+            for one in self.outcomes
+        ]
         pair = self.pair and [_asked(self.pair[0].candidate), _asked(self.pair[1])]
-        content: dict[str, Any] = plain({
-            **stamp(),
-            "tests": [one.name for one in self.tests],
-            "model": self.model,
-            "relaxation": self.relaxation,
-            "seed": self.seed,
-            "advice": best and _asked(best.candidate) | {
-                "determined": best.determined, "open": best.open, "breaks": best.breaks,
-                "expected": best.expected,
-            },
-            "now": self.now,
-            "candidates": [
-                _asked(one.candidate) | {
-                    "breaks": one.breaks, "number_determined": one.number,
-                    "expected": one.expected, "peak_force": one.force,
-                    "quantity_error": one.error, "told_apart": one.apart,
-                }
-                for one in self.outcomes
-            ],
-            "pair": pair and {"tests": pair, "determined": self.pair and self.pair[0].determined},
-            "never_determined": self.never,
-            "closing_velocity": [
-                {"mass": mass, "half": ends[0], "sure": ends[1]}
-                for mass, ends in self.closing.items()
-            ],
-            "quantity": self.quantity,
-            "rig": self.rig,
-            "sentences": self.sentences,
-        })  # fmt: skip
-        return content
+        content["pair"] = self.pair and {"tests": pair, "determined": self.pair[0].determined}
+        closing = self.closing.items()
+        ends = [{"mass": mass, "half": half, "sure": sure} for mass, (half, sure) in closing]
+        content |= {"never_determined": self.never, "closing_velocity": ends}
+        content |= {key: getattr(self, key) for key in ("quantity", "rig", "sentences")}
+        return dict(plain(content))
 
     def text(self, *, verbose: bool = False) -> str:
         """Return the text that the command prints."""
