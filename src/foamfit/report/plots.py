@@ -301,14 +301,6 @@ class Values:
         """Whether the parameter follows a rate law."""
         return self.joint is not None and self.joint.kind in RATES
 
-    @property
-    def note(self) -> str:
-        """Kind of the parameter in a joint fit, and the slope of a rate law."""
-        if self.joint is None:
-            return ""
-        slope = "" if self.joint.b is None else f", b = {self.joint.b:.2g}".replace("-", "−")
-        return f"{self.joint.kind}{slope}"
-
 
 def values_of(tests: Sequence[str], parameters: ByTest) -> list[Values]:
     """Return a panel for each parameter, given its value, or None, in each test."""
@@ -376,7 +368,9 @@ def _draw_panel(ax: Axes, panel: Values, tests: Sequence[str], roomy: bool) -> N
     ax.set_xlim(low, high)
     ax.set_title(f"{panel.head} ({unit})" if unit else panel.head, fontsize=7.5, pad=3)
     ax.set_label(panel.name)
-    ax.set_xlabel(panel.note, fontsize=6.5, labelpad=1, color=GREY)
+    if (joint := panel.joint) is not None:
+        slope = "" if joint.b is None else f", b = {joint.b:.2g}".replace("-", "−")
+        ax.set_xlabel(f"{joint.kind}{slope}", fontsize=6.5, labelpad=1, color=GREY)
     ax.tick_params(axis="x", labelsize=5.5, length=2, pad=1.5)
     ax.locator_params(axis="x", nbins=2, steps=[1, 2, 5, 10])
     ticks = [tick for tick in ax.get_xticks() if low <= tick <= high]

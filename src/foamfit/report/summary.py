@@ -97,8 +97,6 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
     rows = [readable(name, p) for name, p in result.parameters.items()]
     values: dict[str, Any] = {
         "result": result,
-        "m": result.measurement,
-        "ladder": result.ladder,
         "shown": misfit_words(misfits(result)),
         "fixed": [row for row in rows if row.state == "fixed"],
         "determined": determined(result),

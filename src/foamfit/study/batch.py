@@ -199,11 +199,9 @@ def batch(
         `foamfit.fit_cycles`, and each has a row in the summary.
     cycles : (int, int), optional
         First and last of several cycles that are fitted as one history.
-    report : bool
-        Whether to write a report and figures for each fit.
-    figure_width : str
-        "one" or "two" columns, or a length such as "85 mm". A test whose figures have another
-        width is fitted again, because its curves are not stored.
+    report, figure_width
+        As for `foamfit.FitResult.save`. A test whose figures have another width is fitted again,
+        because its curves are not stored.
     progress : callable, optional
         Called with the `Batch` after each test; its `rows`, `tests`, `wrong` and `fitted` describe
         the progress, and at the end its `summary` the results.
