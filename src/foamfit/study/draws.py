@@ -153,19 +153,9 @@ def _stretch(known: Known, tests: Sequence[Test]) -> Array:
 
 
 def _draws(
-    known: Known,
-    tests: Sequence[Test],
-    every: Sequence[Draw],
-    rng: np.random.Generator,
-    count: int,
+    known: Known, tests: Sequence[Test], every: Sequence[Draw], rng: np.random.Generator, count: int
 ) -> tuple[list[Draw], Array]:
-    """Return parameters that follow the tests about as well as the best point.
-
-    Parameters whose branch was reached are drawn from their covariance, including model error, and
-    the others from what the law calls likely, or from the limits of the search; a published set is
-    known but for the former. A draw that raises the cost by more than noise and model error allow
-    is drawn again, nearer to what explains the tests. Also returns the weights of the explanations.
-    """
+    """Return draws that follow the tests about as well as the best, and weights of explanations."""
     problem, k = known.problem, len(known.names)
     space, at = problem.space(), np.array([problem.index[name] for name in known.names])
     measured = any(one.fit is not None for one in tests)
@@ -185,6 +175,8 @@ def _draws(
         inverse = np.linalg.inv(one.bread + prior)
         spread = inverse @ (one.meat + prior) @ inverse + allowed / 1.96**2 * inverse
         power, axes = np.linalg.eigh(spread)
+        # Parameters of other branches are drawn from what the law calls likely, or from the limits
+        # of the search; those of a published set are known.
         axes = np.where(one.reached[:, None], axes * np.sqrt(np.maximum(power, 0.0)), 0.0)
         best = space.encode(one.vectors[0])  # steps are taken in the coordinates of the search
         slopes = space.slopes(best, one.vectors[0])[at] / one.sizes[:, None]
@@ -197,6 +189,7 @@ def _draws(
         chosen = int(rng.choice(len(every), p=weights)) if len(every) > 1 else 0
         one, (best, axes) = every[chosen], steps[chosen]
         found, open_ = one.vectors[0], at[~one.reached & measured]
+        # What noise and model error do not allow is drawn again, nearer to what explains the tests.
         for step in 0.95 ** np.arange(TRIES):
             point = np.clip(best + step * axes @ rng.normal(size=k), *space.box)
             values = _with_open(problem, space, space.decode(point), open_, rng)

@@ -198,11 +198,9 @@ def ranges_of(point: JointPoint) -> tuple[dict[str, Ends], list[Together]]:
 
 
 def own_ranges(point: JointPoint, refits: Sequence[Together]) -> tuple[dict[str, Ends], ...]:
-    """Return the ranges due to model error of the values that each test has for itself.
-
-    A range is the hull of values that fit the test almost equally well while the shared values stay
-    where they are (`trust.ranges`), and of those in the `refits` with other shared values.
-    """
+    """Return the ranges due to model error of the values that each test has for itself."""
+    # The hull of values that fit the test almost equally well with the same shared values
+    # (`trust.ranges`), and of those in the `refits` with other shared values.
     out = []
     for t, best in enumerate(point.bests):
         problem = best.problem

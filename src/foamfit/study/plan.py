@@ -230,12 +230,10 @@ def _outcome(known: Known, target: gain.Target | None, one: Candidate, *seen: Se
 
 
 def _advised(safe: Sequence[Outcome], now: float) -> Outcome | None:
-    """Return the advised one of some safe tests; None if there are none.
-
-    It is the softest of those that determine most parameters with the narrowest intervals, or with
-    a quantity asked for the one with its least error; if none determines more than `now`, it is the
-    one with the narrowest intervals. With rivals it tells them apart, if a test can.
-    """
+    """Return the advised one of some safe tests; None if there are none."""
+    # The softest of those that determine most parameters with the narrowest intervals, or with a
+    # quantity asked for the one with its least error; if none determines more than `now`, the one
+    # with the narrowest intervals. With rivals it tells them apart, if a test can.
 
     def least_apart(one: Outcome) -> float:
         return min(one.apart.values(), default=math.inf)
