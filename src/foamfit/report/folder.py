@@ -112,9 +112,8 @@ def save_whole(folder: str | Path, write: Callable[[Path], None]) -> Path:
             write(fresh)
             check_target(folder)  # keep files that were added in the meantime
     except OSError as error:
-        raise InputError(
-            f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
-        ) from error
+        why = f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
+        raise InputError(why) from error
     return folder
 
 
@@ -173,9 +172,8 @@ def check_target(folder: str | Path, *, of: str | None = None, kept: bool = Fals
             if path.exists() and not os.access(path, os.W_OK | os.X_OK):
                 raise PermissionError(0, f"Permission denied in {path}")
     except (OSError, RuntimeError) as error:  # RuntimeError: a link to itself
-        raise InputError(
-            f"{folder} cannot be written: {reason(error)}; choose another folder"
-        ) from error
+        why = f"{folder} cannot be written: {reason(error)}; choose another folder"
+        raise InputError(why) from error
 
 
 def check_same(folder: str | Path, data_sha256: str, options: Mapping[str, Any]) -> None:
@@ -269,9 +267,8 @@ def load_result(folder: str | Path) -> dict[str, Any]:
         inside = sorted(str(one.parent) for one in path.glob("*/fit.json"))
         path = path / "fit.json"
         if inside and not path.is_file():
-            raise InputError(
-                f"{folder} contains {counted(len(inside), 'fit')}; name one, like {inside[0]}"
-            )
+            why = f"{folder} contains {counted(len(inside), 'fit')}; name one, like {inside[0]}"
+            raise InputError(why)
     try:
         content = json.loads(read_whole(path))
     except OSError as error:
@@ -284,9 +281,8 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     if not isinstance(content, dict) or "schema" not in content:
         raise InputError(f"{path} is not the result of a fit (it has no schema number)")
     if content["schema"] != SCHEMA:
-        raise InputError(
-            f"{path} has schema {content['schema']}, but this version of foamfit reads {SCHEMA}"
-        )
+        why = f"{path} has schema {content['schema']}, but this version of foamfit reads {SCHEMA}"
+        raise InputError(why)
     return content
 
 
