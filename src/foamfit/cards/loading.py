@@ -230,7 +230,7 @@ def unloading_curve(curves: Curves, unloading: Unloading) -> Array:
 def fit_unloading(
     replays: Sequence[Replay], targets: Sequence[Array], *, expon: bool = True
 ) -> Unloading:
-    """Fit the unloading to stresses (Pa) over their ranges; without `expon` the exponent is 1."""
+    """Fit the unloading to stresses (Pa) relative to their ranges; without `expon`, EXPON is 1."""
     free = slice(None) if expon else slice(2)
     weights = [1.0 / (np.ptp(target) * np.sqrt(target.size)) for target in targets]
 

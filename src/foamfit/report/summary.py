@@ -218,7 +218,7 @@ def tables(result: Fit) -> dict[str, list[list[str]]]:
 
 
 def render_report(result: Fit, drawn: Mapping[str, Figure], fit_svg: bytes | None = None) -> str:
-    """Return the report as a self-contained HTML page with the figures of `figures_of`."""
+    """Return the report as a self-contained HTML page; `drawn` are the figures of `figures_of`."""
     svg = {} if fit_svg is None else {"fit": fit_svg}
     svg |= {name: images(one, "svg")[0] for name, one in drawn.items() if name not in svg}
     plain, springs, insight = result.to_json_dict(), result.springs, result.insight

@@ -49,7 +49,11 @@ EXPLAINED = 3  # number of explanations that are tried besides exchanges
 def known_of(
     tests: Sequence[Test], rng: np.random.Generator, draws: int, informed: int | None = None
 ) -> Known:
-    """Return what some tests of one foam say about its springs; without draws, the best point."""
+    """Return what some tests of one foam say about the parameters of its springs.
+
+    The information is computed in the first `informed` draws, by default in all. Without draws
+    only the best point is known.
+    """
     first, at_hand = tests[0].problem, [one.values for one in tests]
     names = tuple(name for name in first.free() if name not in NUISANCE)
     missed, share, roots = _of_fits(tests, names)

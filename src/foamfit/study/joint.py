@@ -259,7 +259,7 @@ def evidence(
 def choose_kinds(
     alone: Together, links: Links, names: list[str], starts: Sequence[Vectors], kinds: list[str]
 ) -> Links:
-    """Return links in which these parameters have the kinds of least BIC, from all shared on."""
+    """Return links in which these parameters have the kinds of least BIC, at first all shared."""
     best = fit_linked(alone.problems, links.having(**dict.fromkeys(names, "shared")), starts)
     now = None
     while best is not now:
