@@ -340,7 +340,7 @@ def _curve(
     law_error = span * source.law_errors.get(channel, 0.0)
     parts["law_error"] = law_error * np.sqrt(_growth(problem.measurement, source))
     contained = {"scatter", "parameters"} if drawn else {"scatter"}  # in the draws
-    more = sum(parts[part] ** 2 for part in parts.keys() - contained)
+    more = sum(half**2 for part, half in parts.items() if part not in contained)
     kept = np.zeros(n, dtype=bool)
     kept[objective.kept[name]] = True
     return PredictedCurve(
