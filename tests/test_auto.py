@@ -25,11 +25,10 @@ from conftest import (
 from foamfit import auto, one_model
 from foamfit.data.measurement import Specimen, Striker
 from foamfit.fitting import search
-from foamfit.fitting.branches import branch_of_samples
 from foamfit.springs import laws
 from foamfit.springs.model import Model
 from foamfit.trust import evidence
-from foamfit.trust.best_point import BestPoint
+from foamfit.trust.best_point import BestPoint, branch_of_samples
 from foamfit.trust.evidence import find_structure, neighbours_test, runs_test
 
 HEIGHT, AREA = 1.2e-3, 1.9635e-5

@@ -171,7 +171,7 @@ def test_a_stopped_fit_is_marked_everywhere(here, monkeypatch):
 def test_sigterm_keeps_the_best_so_far(here, monkeypatch):
     small_pictures(monkeypatch)
     end = partial(signal.raise_signal, signal.SIGTERM)
-    monkeypatch.setattr(one_model, "settle_ends", lambda *_: end())  # stop after the search
+    monkeypatch.setattr(one_model.settle, "settle_ends", lambda *_: end())  # stop after the search
     call = ["fit", str(fabricated_csv(here)), "--starts", "2", "--out", "stopped"]
     out = run(*call)
     assert out.stderr == ""

@@ -55,9 +55,9 @@ def rows(found: dict[str, ff.Measurement]) -> Iterator[dict[str, object]]:
             "selected": result.law,
             "misfit (%)": round(100.0 * misfit, 2), "seconds": round(seconds, 2),
             "times plain SciPy": round(2.0 * seconds / (unit + later), 1),
-            "simulations": effort.simulations,
-            "ms each": round(1e3 * effort.simulating / effort.simulations, 2),
-            "compiled (%)": round(100.0 * effort.compiled / effort.total),
+            "simulations": effort["simulations"],
+            "ms each": round(1e3 * effort["simulating"] / effort["simulations"], 2),
+            "compiled (%)": round(100.0 * effort["compiled"] / effort["total"]),
         }  # fmt: skip
         unit = later
 

@@ -18,11 +18,10 @@ from foamfit.codec import plain
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, as_signalled
 from foamfit.fitting import search
+from foamfit.fitting.box import carried
 from foamfit.fitting.curves import check_time_shift, choose_drive
-from foamfit.fitting.minima import in_order, settle_ends
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params, make_problem
 from foamfit.fitting.search import STOPPING, SearchRecord, SearchStoppedError, Tracker, what_stopped
-from foamfit.fitting.starts import carried
 from foamfit.options import DRAWS, FREED, STARTS, STARTS_IN_SERIES, Given, Watch
 from foamfit.results import Fit, Intervals
 from foamfit.solve.cache import SPENT
@@ -33,7 +32,7 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.covariance import AT_LIMIT
 from foamfit.trust.intervals import Announce, Choice, assess, evaluations_of
-from foamfit.trust.ranges import Open, left_open
+from foamfit.trust.refits import Open, left_open
 
 CARRIED = 8  # minima of a poorer model from which the search of a richer one begins
 Progress = Callable[[float, str], None]
@@ -189,7 +188,7 @@ class Found:
         """
         problem, space, cost = self.problem, self.problem.space(), self.tracker.best_cost
         assert self.tracker.best_values is not None  # checked by identify
-        values = in_order(space, problem.objective, self.tracker.best_values) + 0.0  # no -0
+        values = settle.in_order(space, problem.objective, self.tracker.best_values) + 0.0  # no -0
         names, moved = problem.free(), values.copy()
         places = [problem.index[name] for name in names]
         near = AT_LIMIT * problem.sizes(names, values)
@@ -231,7 +230,7 @@ def identify(
     found = _search(Found(problem, tracker, record), options.vary, given, progress, known)
     if tracker.best_values is None:
         objective, why = found.problem.objective, "check the drive, the heights and the bounds"
-        tried = objective.evaluations
+        tried = objective.spent.evaluations
         try:
             objective.simulate(found.problem.vector())
         except SimulationError as error:
@@ -265,11 +264,11 @@ def judge(
 
 def _pulse(found: Found, best: BestPoint, choice: Choice, progress: Progress) -> Callable[[], None]:
     """Return a function that reports the progress of ranges and intervals by evaluations."""
-    objective, spent = found.problem.objective, found.problem.objective.evaluations
+    spent, before = found.problem.objective.spent, found.problem.objective.spent.evaluations
     share = JUDGED if choice.ranges and best.misfits else JUDGED_NOISE
-    expected = max(share * spent, 1.0) + evaluations_of(best, choice)
+    expected = max(share * before, 1.0) + evaluations_of(best, choice)
     progress(0.0, "intervals")
-    return lambda: progress(min((objective.evaluations - spent) / expected, 0.97), "intervals")
+    return lambda: progress(min((spent.evaluations - before) / expected, 0.97), "intervals")
 
 
 def _assess(
@@ -277,7 +276,7 @@ def _assess(
 ) -> tuple[BestPoint, SearchRecord, Intervals]:
     """Compute ranges and intervals; if they find a better point, start again from it."""
     problem, tracker, record = found.problem, found.tracker, found.record
-    budget = PROFILE_SHARE * problem.objective.evaluations
+    budget = PROFILE_SHARE * problem.objective.spent.evaluations
     left, cost_of_ranges = Open(), math.inf
     for restarts in range(IMPROVEMENTS + 1):
         before = tracker.best_cost
@@ -359,7 +358,7 @@ def _search(
         settle.descend_again(problem, tracker)
         for step, freed in settle.steps(problem, tracker, asked, given, search_held):
             problem, record = step, replace(record, freed=freed)
-        settle_ends(tracker, problem.space())
+        settle.settle_ends(tracker, problem.space())
     except STOPPING as error:
         if tracker.best_values is None and coarse.best_values is not None:
             tracker.consider(coarse.best_values)

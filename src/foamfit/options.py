@@ -24,6 +24,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 DRIVES = ("impact", "stress", "displacement")
 METHODS = ("auto", "local", "profile", "mcmc")  # of the intervals
+# Links of a parameter between several tests; see `fitting.together`.
+LOG_RATE, POWER_RATE = "log rate", "power rate"
+RATES = (LOG_RATE, POWER_RATE)
+KINDS = ("shared", "own", "scatter", *RATES)
 # Start points per spring, per spring if several are hysteretic, and the largest number in all.
 STARTS, STARTS_IN_SERIES, MOST_STARTS = 16, 24, 100_000
 MOST_TERMS = 10  # relaxation terms

@@ -26,7 +26,7 @@ class ParameterEstimate:
     area, mass and calibration in the TOML; `stderr` and `ci95` do not include it. It is 0 where no
     ± is stated or the test does not determine the parameter, and None in a joint fit.
 
-    The other fields are None in the fit of one test. `kind` is one of `links.KINDS` or "fixed".
+    The other fields are None in the fit of one test. `kind` is one of `options.KINDS` or "fixed".
     `value` is then the common value: for a scattering parameter that of the median specimen, for a
     rate law that at the rate of the median test, for an own parameter the median over the tests,
     which has neither error nor state. `tests` contains the value in each test, unless it is the
@@ -67,6 +67,14 @@ class ParameterEstimate:
             return replace(self.tests[test], unit=self.unit)
         missing: Any = {one.name: None for one in fields(self) if "omitted" in one.metadata}
         return replace(self, **missing)
+
+
+def covered(seen: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the branches about which visits to `seen` carry information.
+
+    On the reversible branch of a microscale spring some micro-springs snap through as well.
+    """
+    return (*seen, "snap-through") if "reversible" in seen else seen
 
 
 def law_in_words(model: str, relaxation: int = 0, damping: str = "none") -> str:

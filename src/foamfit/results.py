@@ -270,7 +270,7 @@ class Fit(OfLaw):
     contradictions: tuple[Contradiction, ...] = ()  # of the record, which the fit does not settle
     # All parameters at which the weights due to an uncertain motion were found, SI; empty without
     weighed_at: tuple[float, ...] = ()
-    # The problem of the fit, and what the fit cost (`fitting.objective.Effort`); not in its folder
+    # The problem of the fit, and what the fit cost (`trust.conclude`); not in its folder
     problem: Any = field(default=None, repr=False)
     effort: Any = None
 

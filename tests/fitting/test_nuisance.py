@@ -79,7 +79,7 @@ def driven() -> Objective:
 
 def test_a_driving_motion_is_smooth_and_what_is_unsure_of_it_moves_the_residual(driven):
     """The residual changes as in a simulation with a motion shifted along one of its modes."""
-    motion, time = driven.motion, driven.time
+    motion, time = driven.scenes.motion, driven.time
     clean = 0.5 * HEIGHT * np.sin(np.pi * time / 4.0) ** 2
     level = driven.measurement.noise.displacement
     assert np.sqrt(np.mean((motion.at(time) - clean) ** 2)) < 0.4 * level

@@ -8,8 +8,8 @@ import rig
 import truth
 from conftest import AREA, HEIGHT, NAMES, loop_measurement
 from foamfit.data.measurement import Specimen
-from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
+from foamfit.fitting.together import Links
 from foamfit.springs.model import Model, exchanges
 from foamfit.study.joint_fit import fit_jointly, parameters_of
 

@@ -10,9 +10,9 @@ from conftest import HEIGHT, synthetic_loop
 from foamfit.errors import InputError
 from foamfit.fitting import together as engine
 from foamfit.fitting.levenberg import Iterate
-from foamfit.fitting.links import KINDS, LOG_RATE, POWER_RATE, Links
 from foamfit.fitting.problem import make_problem
-from foamfit.fitting.together import fit_linked
+from foamfit.fitting.together import Links, fit_linked
+from foamfit.options import KINDS, LOG_RATE, POWER_RATE
 
 SPRING, LOOP = synthetic_loop(noise=0.0)
 X = np.log([0.1, 1.0, 10.0])

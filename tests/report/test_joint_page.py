@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 import foamfit as ff
 from conftest import AREA, HEIGHT
 from foamfit.data.measurement import Measurement, Noise, Specimen
-from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
-from foamfit.fitting.together import Together
+from foamfit.fitting.together import Links, Together
 from foamfit.parts import ParameterEstimate
 from foamfit.report.figures import images
 from foamfit.study.joint_fit import fit_jointly

@@ -7,7 +7,7 @@ from scipy.linalg import toeplitz
 from conftest import correlated
 from foamfit.trust.best_point import growth
 from foamfit.trust.covariance import Block, Uncertainty, covariance, half_width, state
-from foamfit.trust.residuals.noise_process import NoiseProcess, autocorrelation_time
+from foamfit.trust.residuals import NoiseProcess, autocorrelation_time
 
 
 def about(value: float, half: float) -> tuple[tuple[float, float], str]:

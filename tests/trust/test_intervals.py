@@ -26,6 +26,7 @@ from conftest import (
 )
 from foamfit.data.measurement import Specimen, Striker
 from foamfit.errors import InputError
+from foamfit.fitting.objective import Spent
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.fitting.search import SearchRecord, Tracker
 from foamfit.one_model import Found, judge
@@ -36,8 +37,8 @@ from foamfit.trust import intervals
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.conclude import conclude
 from foamfit.trust.intervals import Choice, assess, mcmc
-from foamfit.trust.profile import trace
-from foamfit.trust.residuals.noise_process import NoiseProcess, noise_processes
+from foamfit.trust.refits import trace
+from foamfit.trust.residuals import NoiseProcess, noise_processes
 
 
 def profile(best: BestPoint, name: str) -> Profile:
@@ -51,8 +52,7 @@ class Curve:
     time: np.ndarray
     data: np.ndarray
     bend: float = 0.0
-    evaluations: int = 0
-    failures: int = 0
+    spent: Spent = field(default_factory=Spent)
     penalty: float = 1e3
     drive: str = "displacement"
     priors: tuple[()] = ()
@@ -68,7 +68,7 @@ class Curve:
         return a + b * self.time + self.bend * b**2 * self.time**2
 
     def simulate(self, values: np.ndarray, *, everything: bool = False) -> np.ndarray:
-        self.evaluations += 1
+        self.spent.evaluations += 1
         return self.model(values)
 
     def compare(self, curves: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -340,11 +340,11 @@ def test_a_chain_runs_over_what_is_not_determined_within_its_limits():
 def test_nothing_is_drawn_where_nothing_is_determined(method):
     around = levels(names=("a", "c"))
     assert around.known == []
-    before = around.problem.objective.evaluations
+    before = around.problem.objective.spent.evaluations
     found = assess(around, Choice(method, 200))
     assert "determines no parameter" in found.warnings[0]
     assert found.ends == {}
-    assert around.problem.objective.evaluations == before
+    assert around.problem.objective.spent.evaluations == before
     by_default = assess(around, Choice())
     assert (by_default.ends, by_default.warnings) == ({}, ())
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from conftest import HEIGHT, NAMES, synthetic_loop
-from foamfit.fitting.links import Links
 from foamfit.fitting.problem import make_problem
-from foamfit.fitting.together import fit_linked
+from foamfit.fitting.together import Links, fit_linked
 from foamfit.study.joint_fit import errors_of, fit_jointly
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.joint_point import JointPoint

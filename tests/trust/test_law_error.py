@@ -24,10 +24,8 @@ from foamfit.report.render import readable
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import RULE, Block, Uncertainty, covariance
 from foamfit.trust.intervals import Choice
-from foamfit.trust.profile import Refit
-from foamfit.trust.ranges import ALIKE, ends_alike, left_open, refits_alike, tolerance
-from foamfit.trust.residuals.law_error import curve_errors
-from foamfit.trust.residuals.noise_process import NoiseProcess
+from foamfit.trust.refits import ALIKE, Refit, ends_alike, left_open, refits_alike, tolerance
+from foamfit.trust.residuals import NoiseProcess, curve_errors
 
 
 def wave(n: int) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from foamfit.trust.scatter import common_and_spread, correlation
+from foamfit.trust.joint_point import common_and_spread, correlation
 
 
 def test_equal_errors_leave_what_the_text_books_have():

@@ -26,10 +26,8 @@ from foamfit.springs.model import Model
 CURVES = ("stress_time", "displacement_time", "stress_strain")
 # Curve of an impact with an accelerometer on the striker and no measured displacement.
 ACCELERATION = "acceleration_time"
-# Curves that need a motion.
-MOTION_CURVES = ("displacement_time", "stress_strain")
-# A smooth motion is used if its residuals are at most this multiple of the noise.
-FOLLOWED = 1.5
+MOTION_CURVES = ("displacement_time", "stress_strain")  # curves that need a motion
+FOLLOWED = 1.5  # a smooth motion is used if its residuals are at most this multiple of the noise
 LOADED = 0.01  # share of the peak stress from which there certainly is load
 # Largest time between contact and the first sample, in sampling intervals, for which the simulation
 # starts at the contact.

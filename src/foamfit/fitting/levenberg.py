@@ -20,10 +20,8 @@ UPDATES, PREDICTED = 6, 0.5
 # A descent ends where a step fails whose predicted gain is below this multiple of `least`: it is of
 # the size of errors of the simulation.
 LITTLE = 100.0
-# A failed step is followed by one of at least about this fraction of its length.
-SHORTEST = 0.1
-# Damping of the trial steps in `following`.
-FOLLOWING = (1e-9, 1e-6, 1e-3, 0.1)
+SHORTEST = 0.1  # a failed step is followed by one of at least about this fraction of its length
+FOLLOWING = (1e-9, 1e-6, 1e-3, 0.1)  # damping of the trial steps in `following`
 
 Jacobian = Any  # an array, or a csr_array of several tests
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import lmfit
 import numpy as np
@@ -16,13 +15,10 @@ from lmfit.minimizer import MinimizerResult
 from foamfit.arrays import Array
 from foamfit.errors import InputError
 from foamfit.fitting.problem import Problem, make_problem
-
-if TYPE_CHECKING:
-    from foamfit.results import Fit
+from foamfit.results import Fit
 
 METHOD = "foamfit, multi-start Levenberg-Marquardt"
-# Largest relative difference between the χ² of a result and that of its own residual.
-SAME = 1e-6
+SAME = 1e-6  # largest relative difference between the χ² of a result and that of its own residual
 INSIDE = 1e-3  # distance of a value from its limit, in standard errors
 
 

@@ -155,10 +155,7 @@ def open_zero(measurement: Measurement, *, glued: bool) -> float:
 
 
 def _motion_at(measurement: Measurement, contact: float) -> tuple[float, float, float]:
-    """Return the motion (m) and its speed at contact, and its noise.
-
-    It is a parabola near contact, as the motion may begin there; far outside the record, a line.
-    """
+    """Return the motion (m) and its speed at contact, and its noise."""
     values, level = measurement.displacement, measurement.noise.of("displacement")
     assert values is not None
     time = measurement.instants
@@ -167,6 +164,7 @@ def _motion_at(measurement: Measurement, contact: float) -> tuple[float, float, 
     reach = max(3, (top - at) // _NEAR)
     near = slice(max(0, at - reach), at + reach + 1)
     since = time[near] - contact
+    # A parabola, as the motion may begin there; far outside the record, a line.
     outside = max(since[0], -since[-1]) > _OUTSIDE * (since[-1] - since[0])
     *_, speed, zero = np.polyfit(since, values[near], 1 if outside else 2)
     return float(zero), float(speed), 0.0 if level is None else level.sigma

@@ -11,36 +11,23 @@ import time
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from foamfit.arrays import Array
 from foamfit.data.measurement import INTEGRATED, Measurement, NoiseLevel
 from foamfit.data.motion import SmoothMotion
 from foamfit.data.noise import with_noise
 from foamfit.errors import InputError, SimulationError, raise_signal
-from foamfit.fitting import nuisance as nuisances
-from foamfit.fitting.curves import (
-    ACCELERATION,
-    CURVES,
-    MOTION_CURVES,
-    check_drive,
-    check_time_shift,
-    checked_weights,
-    interior_curves,
-    is_glued,
-    shows_motion,
-)
+from foamfit.fitting import curves, nuisance as nuisances
+from foamfit.fitting.box import thinned
 from foamfit.fitting.scenes import NOWHERE, Places, Scenes, channel_of
-from foamfit.fitting.starts import thinned
-from foamfit.fitting.weighing import Weighing
 from foamfit.solve.scene import Motion
 from foamfit.springs.model import Model
 
-# Residual after a failed simulation, as a multiple of the measured range.
-PENALTY = 10.0
+PENALTY = 10.0  # residual after a failed simulation, as a multiple of the measured range
 OF_DRIVE = ("those of the drive",)  # default of `Objective.nuisance`
 # Lower limit of the estimated noise, as a fraction of the range of a channel. Fits of the bistable
 # law to measured foams have misfits above 1 %: a smaller noise must not let one channel outweigh
@@ -51,6 +38,9 @@ NORMAL = 1.4826  # standard deviation of normal residuals over their median abso
 RANKING = 1e-3  # allowed error of the simulations that rank starts on a thinned record
 JUMP = 10.0  # ratio of the effects of a mode to both sides of a jump of the residual
 THIN = 0.8  # a record is thinned if at most this fraction of its samples is left
+# Probability at which amplitudes of the motion's modes are no longer credible; one single
+# amplitude may be larger in ten times as many tests (3.5 standard deviations among 20).
+RARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,24 +64,58 @@ class Simulated:
         return {name: rows[1:] for name, rows in self.rows.items()}
 
 
-class Effort(NamedTuple):
-    """What a fit cost: numbers of simulations, and seconds."""
-
-    simulations: int
-    with_derivatives: int  # of these
-    simulating: float  # s, compiled code and what prepares it
-    compiled: float  # s, of these
-    total: float  # s
-
-
 @dataclass
 class Spent:
-    """Simulations so far; an objective made from another one by `replace` counts with it."""
+    """Simulated sets of parameters; an objective made by `replace` counts with its original."""
 
     evaluations: int = 0
     failures: int = 0  # of these
     sloped: int = 0  # with derivatives
     seconds: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Weighing:
+    """Transform of residuals with covariance v + SSᵀ into residuals with covariance v.
+
+    v is diagonal, the noise of each sample. Each column of S is the change of the residual by one
+    standard deviation of a mode of the motion. With S' = S/√v = U d Vᵀ the residual r becomes
+    √v (1 + S'S'ᵀ)^(-1/2) r/√v. `levels` (n,) are √v, `axes` (n, m) is U, and `less` (m,) is
+    1 - (1 + d²)^(-1/2).
+    """
+
+    levels: Array
+    axes: Array
+    less: Array
+    sizes: Array  # d (m,)
+    at: Array  # the parameters at which it was found, SI
+
+    @classmethod
+    def of(cls, uncertain: Array, levels: Array, at: Array) -> Weighing:
+        """Make the transform from S (n, m) and √v (n,)."""
+        axes, size, _ = np.linalg.svd(uncertain / levels[:, None], full_matrices=False)
+        return cls(levels, axes, 1.0 - 1.0 / np.sqrt(1.0 + size**2), size, at)
+
+    def amplitudes(self, residual: Array) -> Array:
+        """Return the residual along the modes over its standard deviation, of modes with d > 1.
+
+        They are standard normal if the motion's uncertainty and noise explain the residual.
+        """
+        along = (residual / self.levels) @ self.axes / np.sqrt(1.0 + self.sizes**2)
+        return np.asarray(along[self.sizes > 1.0])
+
+    def explains(self, residual: Array) -> bool:
+        """Return whether noise and the uncertainty of the motion can explain a residual (n,)."""
+        sizes = self.amplitudes(residual) ** 2
+        if not sizes.size:
+            return True
+        most = chdtri(sizes.size, RARE), chdtri(1, 10.0 * RARE / sizes.size)
+        return bool(sizes.sum() <= most[0] and sizes.max() <= most[1])
+
+    def __call__(self, rows: Array) -> Array:
+        """Transform residuals (n,), or columns of their derivatives (n, k)."""
+        along = (rows.T / self.levels) @ self.axes * self.less
+        return np.asarray(rows - (self.levels * (along @ self.axes.T)).T)
 
 
 @dataclass(eq=False)
@@ -114,7 +138,7 @@ class Objective:
     weighing: Weighing | None = None  # Effect of an uncertain driving motion; see `weigh_motion`
     given: tuple[nuisances.Prior, ...] = ()  # Priors of spring parameters
     erring: bool = False  # Whether the law errs, so that priors count by the scales of the curves
-    followed: tuple[SmoothMotion | None, ...] = ()  # `motion`, if it is already known
+    followed: tuple[SmoothMotion | None, ...] = ()  # `Scenes.motion`, if it is already known
     averaged: float = np.inf  # longest time that a sample averages, s, if the samples are thinned
     glued: bool | None = None  # see `is_glued`; None: as the record shows
     spent: Spent = field(default_factory=Spent)
@@ -125,18 +149,20 @@ class Objective:
 
     def __post_init__(self) -> None:
         """Prepare the scenes and the scale of each curve."""
-        check_drive(self.measurement, self.drive)
+        curves.check_drive(self.measurement, self.drive)
         if self.time_shift:
-            check_time_shift(self.measurement, self.drive)
+            curves.check_time_shift(self.measurement, self.drive)
         if self.nuisance == OF_DRIVE:
             self.nuisance = nuisances.names_of(self.drive, time_shift=self.time_shift)
         self.measurement = test = with_noise(self.measurement)
-        self.interior = interior_curves(test, len(self.model.kinds))
+        self.interior = curves.interior_curves(test, len(self.model.kinds))
         self._accelerated = self.drive == "impact" and test.acceleration is not None
-        self.curves = (*CURVES, *((ACCELERATION,) if self._accelerated else ()), *self.interior)
-        self.weights = checked_weights(self.weights, self.curves)
+        felt = (curves.ACCELERATION,) if self._accelerated else ()
+        self.curves = (*curves.CURVES, *felt, *self.interior)
+        self.weights = curves.checked_weights(self.weights, self.curves)
         leaves = self.drive == "impact" or self.model.relaxation or test.last_cycle is not None
-        self.glued = is_glued(test, leaves=bool(leaves)) if self.glued is None else self.glued
+        if self.glued is None:
+            self.glued = curves.is_glued(test, leaves=bool(leaves))
         self.scenes = Scenes(
             test, self.model, self.drive, self.curves, self.interior, self.nuisance, self.rtol,
             self.interior_mass, self.followed, self.averaged, self.glued,
@@ -202,7 +228,7 @@ class Objective:
 
         Each curve has the same weight in the sum of squares as with all samples.
         """
-        motion = self.motion if self.driven else None
+        motion = self.scenes.motion if self.driven else None
         test = thinned(self.measurement, None if motion is None else motion.at(self.time))
         if test.stress.size > THIN * self.time.size:
             return self
@@ -214,11 +240,6 @@ class Objective:
         pairs = zip(self.counted, self.sizes, few.sizes, strict=True)
         more = {name: self.weights[name] * size / left for name, size, left in pairs}
         return replace(few, weights=self.weights | more)
-
-    @property
-    def motion(self) -> SmoothMotion | None:
-        """The measured motion without its noise, or None; see `driving_motion`."""
-        return self.scenes.motion
 
     def weigh_motion(self, values: Array) -> bool:
         """Weight the residuals by the uncertainty of the driving motion; False if it has none.
@@ -284,7 +305,7 @@ class Objective:
             measured |= {"displacement_time": test.displacement, "stress_strain": test.stress}
         measured |= {name: test.interior[node] for name, node in self.interior.items()}
         if self._accelerated and test.acceleration is not None:
-            measured[ACCELERATION] = test.acceleration
+            measured[curves.ACCELERATION] = test.acceleration
         return {n: curve for n, curve in measured.items() if n in self.scenes.present}
 
     def noise(self, name: str) -> NoiseLevel:
@@ -294,17 +315,14 @@ class Objective:
         return level
 
     def _samples(self, name: str) -> NDArray[np.intp]:
-        """Return the indices of the samples that count: measured ones without outliers.
-
-        A stress along a motion that does not drive counts where both were measured.
-        """
+        """Return the indices of the samples that count: measured ones without outliers."""
         channel, every = channel_of(name), np.ones(self.time.size, dtype=bool)
         counts = self.measurement.sampled.get(channel, every)
         if name == "stress_strain" and not self.driven:
             counts = counts & self.measurement.sampled.get("displacement", every)
         outliers = self.measurement.outliers.get(channel)
         if self.drive == "stress":
-            counts = counts & shows_motion(self.scenes.driving(self.time))
+            counts = counts & curves.shows_motion(self.scenes.driving(self.time))
         return np.flatnonzero(counts if outliers is None else counts & ~outliers.left_out)
 
     # ------------------------------------------------------------------ simulation and residual
@@ -331,16 +349,6 @@ class Objective:
         finally:
             self.spent.seconds += time.perf_counter() - began
 
-    @property
-    def evaluations(self) -> int:
-        """Number of simulated sets of parameters."""
-        return self.spent.evaluations
-
-    @property
-    def failures(self) -> int:
-        """Number of failed simulations."""
-        return self.spent.failures
-
     def residual(self, values: Array) -> Array:
         """Return the weighted residuals of all counted curves and of the priors, dimensionless.
 
@@ -354,9 +362,9 @@ class Objective:
         except SimulationError:
             return np.append(np.full(self.n_data, self.penalty), self.off_priors(values))
 
-    def compare(self, curves: Simulated, values: Array) -> Array:
+    def compare(self, simulated: Simulated, values: Array) -> Array:
         """Return the residuals of simulated curves; see `residual`."""
-        off = self._gathered(curves.rows)[0]
+        off = self._gathered(simulated.rows)[0]
         # The stress may be huge near the pole of branch c.
         off = np.maximum(np.minimum(off, self.penalty), -self.penalty)
         off = off if self.weighing is None else self.weighing(off)
@@ -431,25 +439,22 @@ class Objective:
 
     def by_curve(self, residual: Array) -> dict[str, Array]:
         """Split a residual into the parts of the counted curves."""
-        parts = np.split(residual[: self.n_data], np.cumsum(self.sizes)[:-1])
-        return dict(zip(self.counted, parts, strict=True))
+        return {name: residual[at] for name, *_, at in self._parts}
 
     def rms(self, residual: Array) -> dict[str, float]:
         """Return the RMS deviation of each counted curve in its unit, from a residual."""
-        return {
-            name: float(np.sqrt(np.mean(part**2))) / self.factor(name)
-            for name, part in self.by_curve(residual).items()
-        }
+        parts = self.by_curve(residual).items()
+        return {name: float(np.sqrt(np.mean(own**2))) / self.factor(name) for name, own in parts}
 
-    def misfit(self, curves: Simulated) -> dict[str, float | None]:
+    def misfit(self, simulated: Simulated) -> dict[str, float | None]:
         """Return the misfit of each curve: RMS of simulated minus measured over the measured range.
 
         Outliers are left out. It is None if the test or the drive does not have the curve, or if
         its motion was integrated from the force and does not count.
         """
-        derived = MOTION_CURVES if self.measurement.motion == INTEGRATED else ()
+        derived = curves.MOTION_CURVES if self.measurement.motion == INTEGRATED else ()
         shown = [name for name in self.curves if name in self.counted or name not in derived]
-        return {name: self.off(curves, name) if name in shown else None for name in self.curves}
+        return {name: self.off(simulated, name) if name in shown else None for name in self.curves}
 
     def look(self, values: Array) -> dict[str, float | None] | None:
         """Return the misfits of all curves, without counting the evaluation; None if it fails."""
@@ -460,10 +465,10 @@ class Objective:
         except SimulationError:
             return None
 
-    def off(self, curves: Simulated, name: str) -> float | None:
+    def off(self, simulated: Simulated, name: str) -> float | None:
         """Return the misfit of one curve; None if it was not measured or simulated."""
-        measured, simulated = self.measured.get(name), curves.curves.get(name)
-        if measured is None or simulated is None:
+        measured, curve = self.measured.get(name), simulated.curves.get(name)
+        if measured is None or curve is None:
             return None
-        miss = (self.as_read(name, simulated) - measured)[self.kept[name]]
+        miss = (self.as_read(name, curve) - measured)[self.kept[name]]
         return float(np.sqrt(np.mean(miss**2)) / np.ptp(measured))

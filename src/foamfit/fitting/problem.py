@@ -18,15 +18,8 @@ from foamfit.data.calibration import balance
 from foamfit.data.measurement import Measurement
 from foamfit.data.units import LARGEST, parse_uncertain
 from foamfit.errors import InputError
-from foamfit.fitting import nuisance
+from foamfit.fitting import curves, nuisance
 from foamfit.fitting.box import Scales, Space, Tied, follow, others
-from foamfit.fitting.curves import (
-    check_interior,
-    choose_drive,
-    default_weights,
-    history,
-    replaces_striker,
-)
 from foamfit.fitting.objective import Objective
 from foamfit.springs.laws.record import ADMISSIBLE, Between
 from foamfit.springs.model import Model, with_options
@@ -82,7 +75,7 @@ def make_params(
     """
     if isinstance(model, str):
         model = Model.parse(with_options(model, **options), relaxation)
-    drive = choose_drive(measurement) if drive is None else drive
+    drive = curves.choose_drive(measurement) if drive is None else drive
     scales = Scales.of(measurement)
     wanting = ["relaxation"] if model.relaxation else []
     wanting += [f"the stress of '{law.kind}'" for law in model.laws if law.is_viscous]
@@ -93,7 +86,7 @@ def make_params(
     fast = drive == "impact"
     on_striker = fast and (count > 1 or balance(measurement).damping is not None)
     if drive == "displacement" and count == 1:
-        fast = replaces_striker(measurement)
+        fast = curves.replaces_striker(measurement)
     for name in model.names:
         spring, short = split_name(name)
         if short == "height":
@@ -107,7 +100,7 @@ def make_params(
     _add_heights(params, measurement, model)
     late = nuisance.is_late(measurement, time_shift=time_shift)
     _add_nuisance(params, measurement, scales, drive, late)
-    if history(measurement, model) is not None and "displacement_zero" in params:
+    if curves.history(measurement, model) is not None and "displacement_zero" in params:
         # A stress that relaxes may be gone above the strain at which the first contact was.
         params["displacement_zero"].min -= measurement.start_strain * measurement.specimen.height
     for name in params:  # a fifth of the upper end, where the ends are zero and other parameters
@@ -182,7 +175,7 @@ def _add_nuisance(
     params: lmfit.Parameters, measurement: Measurement, scales: Scales, drive: str, late: bool
 ) -> None:
     """Add the nuisance parameters, in the numbers of the file."""
-    weights = default_weights(measurement, drive)
+    weights = curves.default_weights(measurement, drive)
     counted = {
         "displacement": weights["displacement_time"] > 0.0 or drive == "displacement",
         "stress": weights["stress_time"] + weights["stress_strain"] > 0.0,
@@ -234,7 +227,7 @@ class Problem:
     params: lmfit.Parameters
     scales: Scales
     notes: tuple[str, ...] = ()
-    # Nuisance parameters that are held where the record shows them; see `keeping`
+    # Nuisance parameters that are held where the record shows them
     kept: Mapping[str, nuisance.Prior] = field(default_factory=dict)
 
     @property
@@ -288,20 +281,12 @@ class Problem:
         """Return the names of the parameters that vary."""
         return tuple(name for name in self.names if self.params[name].vary)
 
-    def holding(self, name: str, value: float) -> Problem:
-        """Return the problem with a varied parameter fixed at a value; unchanged if it is fixed."""
+    def holding(self, values: Mapping[str, float]) -> Problem:
+        """Return the problem with those parameters that vary fixed at `values`, SI."""
         params = self.params.copy()
-        if name in self.free():
-            params[name].set(value=value, vary=False)
+        for name in values.keys() & self.free():
+            params[name].set(value=values[name], vary=False)
         return replace(self, params=params)
-
-    def keeping(self, shown: Mapping[str, nuisance.Prior]) -> Problem:
-        """Return the problem with free nuisance parameters held where the record shows them."""
-        params = self.params.copy()
-        free = {name: shown[name] for name in self.free() if name in shown}
-        for name, one in free.items():
-            params[name].set(value=one.mean, vary=False)
-        return replace(self, params=params, kept=free)
 
     @cached_property
     def tied(self) -> Tied | None:
@@ -333,10 +318,9 @@ class Problem:
     def space(self, absolute: tuple[str, ...] = ()) -> Space:
         """Return the box of the search; the coordinates of some parameters may be their values."""
         params = [self.params[name] for name in self.names]
-        low, high = np.array([one.min for one in params]), np.array([one.max for one in params])
-        vector = self.vector()
-        free, tied = self.free(), self.tied
-        return Space(self.model, self.names, self.scales, vector, free, low, high, tied, absolute)
+        low, high = np.array([(one.min, one.max) for one in params]).T.copy()
+        own = self.model, self.names, self.scales, self.vector(), self.free()
+        return Space(*own, low, high, self.tied, absolute)
 
     def sizes(self, names: tuple[str, ...], values: Array) -> Array:
         """Return the scales of some parameters at a point."""
@@ -454,15 +438,16 @@ def make_problem(
     """
     model = Model.parse(model_name, relaxation)
     if drive is None:
-        drive = choose_drive(measurement, [n for n, one in (params or {}).items() if one.vary])
+        varied = [name for name, one in (params or {}).items() if one.vary]
+        drive = curves.choose_drive(measurement, varied)
     count = len(model.kinds)
-    check_interior(measurement, count)
+    curves.check_interior(measurement, count)
     notes: tuple[str, ...] = ()
     if interior_mass and (count == 1 or drive != "impact"):
         why = "a single spring has none" if count == 1 else f"none moves in the {drive} drive"
         notes = (f"Interior masses were asked for, but {why}; the fit is the same without them.",)
         interior_mass = False
-    chosen = default_weights(measurement, drive, count) if weights is None else dict(weights)
+    chosen = curves.default_weights(measurement, drive, count) if weights is None else dict(weights)
     time_shift = nuisance.is_late(measurement, time_shift=time_shift)
     for name in [name for name in priors or {} if name not in NUISANCE]:
         _check_known(f"priors: {name}", name, model.name, model.names)

@@ -18,19 +18,7 @@ from foamfit.arrays import Array
 from foamfit.data.measurement import Measurement
 from foamfit.data.motion import SmoothMotion
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting import nuisance as nuisances
-from foamfit.fitting.curves import (
-    ACCELERATION,
-    driven_instants,
-    driving_motion,
-    driving_stress,
-    history,
-    instants,
-    later,
-    moved_at,
-    smooth_stress,
-    without_tension,
-)
+from foamfit.fitting import curves, nuisance as nuisances
 from foamfit.solve.plan import Motion, Plan, plan as make_plan
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.laws.record import BEGUN, HEAVIER, MOVED, STRUCK
@@ -64,14 +52,10 @@ class Wanted(NamedTuple):
 
 def _stacked(motion: Motion, node: int | None = None) -> Array:
     """Return the base stress, or the displacement of a node, stacked on its derivatives."""
-
-    def of(base_stress: Array, displacement: Array) -> Array:
-        return base_stress if node is None else displacement[..., node, :]
-
-    rows = of(motion.base_stress, motion.displacement)[None]
-    if (slopes := motion.slopes) is None:
-        return rows
-    return np.concatenate([rows, of(slopes.base_stress, slopes.displacement)])
+    every = (motion,) if motion.slopes is None else (motion, motion.slopes)
+    if node is None:
+        return np.vstack([one.base_stress for one in every])
+    return np.vstack([one.displacement[..., node, :] for one in every])
 
 
 @dataclass(eq=False)
@@ -98,15 +82,14 @@ class Scenes:
         self.time = test.instants
         sampled = self.drive == "stress" and self.smooth is None
         self._fine = 1 if sampled else min(test.block, FINEST)
-        self.clock = own = instants(self.time, self._fine, self.averaged)
+        self.clock = own = curves.instants(self.time, self._fine, self.averaged)
         self._earlier = 0  # number of instants before a later cycle
         if self.driven:
-            self.clock = driven_instants(test, own, self.motion)
-            if (before := history(test, self.model)) is not None:
+            self.clock = curves.driven_instants(test, own, self.motion)
+            if (before := curves.history(test, self.model)) is not None:
                 self.clock, self._earlier = np.append(before[0], self.clock), before[0].size
         self._own = np.searchsorted(self.clock, own) if self.clock.size > own.size else None
-        driving = {"stress": ["stress_time"], "displacement": ["displacement_time"]}
-        absent = driving.get(self.drive, []) + ["stress_time"] * (test.time is None)
+        absent = f"{self.drive}_time", "stress_time" if test.time is None else ""
         self.present = tuple(name for name in self.curves if name not in absent)
         self._largest = 0.0 if test.displacement is None else float(test.displacement.max())  # m
         self._gravity = (test.striker.gravity if test.striker else None) or 0.0
@@ -121,25 +104,27 @@ class Scenes:
     @cached_property
     def motion(self) -> SmoothMotion | None:
         """The measured motion without its noise, or None; see `driving_motion`."""
-        return self.followed[0] if self.followed else driving_motion(self.measurement, self.time)
+        if self.followed:
+            return self.followed[0]
+        return curves.driving_motion(self.measurement, self.time)
 
     @cached_property
     def smooth(self) -> SmoothMotion | None:
         """What drives the springs, without its noise: a motion (m) or a stress (Pa), or None."""
         if self.drive == "stress":
-            return smooth_stress(self.measurement, self.time)
+            return curves.smooth_stress(self.measurement, self.time)
         return self.motion if self.driven else None
 
     def driving(self, times: Array) -> Array:
         """Return the driving stress at some instants, Pa."""
-        return driving_stress(self.measurement, self.model, times, self.smooth)
+        return curves.driving_stress(self.measurement, self.model, times, self.smooth)
 
     @cached_property
     def _moved(self) -> Array:
         """The measured motion at the simulated instants, m."""
         assert self.measurement.displacement is not None
-        moved = moved_at(self.clock, self.time, self.measurement.displacement, self.motion)
-        if self._earlier and (before := history(self.measurement, self.model)) is not None:
+        moved = curves.moved_at(self.clock, self.time, self.measurement.displacement, self.motion)
+        if self._earlier and (before := curves.history(self.measurement, self.model)) is not None:
             moved[: self._earlier] = before[1]
         return moved
 
@@ -152,8 +137,7 @@ class Scenes:
     @cached_property
     def _zeros(self) -> dict[str, str]:
         """The nuisance parameter that is added to each curve, if there is one."""
-        channels = {channel: zero for zero, channel in nuisances.ZEROS.items()}
-        zeros = {curve: channels.get(channel_of(curve), "") for curve in self.curves}
+        zeros = {curve: f"{channel_of(curve)}_zero" for curve in self.curves}
         return {curve: zero for curve, zero in zeros.items() if zero in self.nuisance}
 
     def modes(self, smooth: SmoothMotion) -> Array:
@@ -178,13 +162,10 @@ class Scenes:
         return DisplacementDrive(self._moved)
 
     def _make(self, loading: Drive) -> dict[bool, Plan]:
-        """Prepare scenes without and with dashpots; they do not depend on the spring parameters.
-
-        Interior masses are included in impacts only; along a prescribed motion the springs are in
-        equilibrium.
-        """
+        """Prepare scenes without and with dashpots; they do not depend on the spring parameters."""
         specimen, count = self.measurement.specimen, len(self.model.kinds)
         heights, masses = [specimen.height / count] * count, [0.0] * count
+        # Along a prescribed motion the springs are in equilibrium.
         if self.interior_mass and count > 1 and isinstance(loading, Impact):
             if specimen.mass is None:
                 raise InputError(
@@ -215,10 +196,8 @@ class Scenes:
             adds = () if followed else ("displacement_zero",)  # which moves nothing
             more = [name for _, name in others if name in OF_NUISANCE and name not in adds]
             columns = {name: own.size + k for k, name in enumerate(more)}
-            given = [(-1, OF_NUISANCE[name]) for name in more]
-            directions = np.concatenate(
-                (self.model.directions[places[own]], np.reshape(given, (-1, 2)).astype(np.int64))
-            )
+            given = np.reshape([(-1, OF_NUISANCE[name]) for name in more], (-1, 2)).astype(np.int64)
+            directions = np.concatenate((self.model.directions[places[own]], given))
             site = tuple(r for r, p in enumerate(places[own].tolist()) if p == len(names) - 1)
             found = Wanted(own, directions, others, columns, damped, site)
             self._asked[key] = found
@@ -237,11 +216,11 @@ class Scenes:
         at = dict(zip(self.nuisance, given, strict=True))
         followed = self.driven or "stress_strain" in counted or everything
         wanted = self.wanted(places, followed)
-        curves, motion = self._curves(springs, at, wanted, counted, everything)
+        found, motion = self._curves(springs, at, wanted, counted, everything)
         if not wanted.others:
-            return curves, motion
+            return found, motion
         out = dict[str, Array]()
-        for curve, rows in curves.items():
+        for curve, rows in found.items():
             out[curve] = every = np.empty((1 + places.size, rows.shape[1]))
             every[0], every[1 + wanted.own] = rows[0], rows[1 : 1 + wanted.own.size]
             for row, name in wanted.others:
@@ -251,10 +230,7 @@ class Scenes:
     def _by_nuisance(
         self, name: str, curve: str, rows: Array, at: dict[str, float], wanted: Wanted
     ) -> Array:
-        """Return the derivative of a curve by a nuisance parameter, (n,).
-
-        `rows` are the curve and its derivatives by the directions of the solver.
-        """
+        """Return the derivative of one of the simulated `rows` by a nuisance parameter, (n,)."""
         by = np.full(rows.shape[1], float(self._zeros.get(curve) == name))
         if name == nuisances.FORCE_SCALE and curve in STRESSES:
             return np.asarray((at.get(self._zeros.get(curve, ""), 0.0) - rows[0]) / at[name])
@@ -295,21 +271,21 @@ class Scenes:
         plan, late = self._placed(self.plans[damped], at), at.get(nuisances.TIME_SHIFT, 0.0)
         motion = run(plan, inside)
         if self.driven and self._slack:
-            motion = without_tension(motion)
+            motion = curves.without_tension(motion)
         shown = motion
         if late != 0.0 and self.drive == "impact":
             shown = run(plan.changed(time=plan.time - late), inside)
         along = motion if self.driven else None
         if along is None and (everything or "stress_strain" in counted) and self._along:
-            along = without_tension(run(self._followed(self._along[damped], at), False))
+            along = curves.without_tension(run(self._followed(self._along[damped], at), False))
         runs = {"stress_time": (motion, None), "displacement_time": (shown, -1)}
         runs |= {name: (shown, node - 1) for name, node in self.interior.items()}
         if along is not None:
             runs["stress_strain"] = along, None
         asked = self.present if everything else counted
         parts = {name: _stacked(*runs[name]) for name in asked if name in runs}
-        if ACCELERATION in asked:
-            parts[ACCELERATION] = self._acceleration(shown, drag, at, wanted)
+        if curves.ACCELERATION in asked:
+            parts[curves.ACCELERATION] = self._acceleration(shown, drag, at, wanted)
         out = {name: self._read(name, rows, at, wanted) for name, rows in parts.items()}
         if everything:
             motion = self._averaged(motion, at.get(nuisances.CONTACT_TIME, 0.0))
@@ -377,10 +353,7 @@ class Scenes:
         return replace(motion, switches=switches, contact_end=motion.contact_end + contact)
 
     def _late(self, name: str, rows: Array, late: float, column: int | None) -> Array:
-        """Return curves on the clock of the file, whose motion is `late` seconds late.
-
-        `column` is the place of their derivative by this time among the directions.
-        """
+        """Return curves, and in `column` their derivative by `late`, on the clock of the file."""
         by_stress = self.drive == "stress"
         simulated = self.drive == "impact" and name != "stress_strain"
         if simulated or (name in STRESSES) == by_stress:
@@ -388,7 +361,7 @@ class Scenes:
 
         def read(row: Array, late: float) -> Array:
             if by_stress:
-                return later(self.time, row, late)
+                return curves.later(self.time, row, late)
             return np.interp(self.time + late, self.time, row)
 
         out = np.array([read(row, late) for row in rows])
@@ -423,5 +396,5 @@ class Scenes:
 
 def channel_of(name: str) -> str:
     """Return the channel that a curve is compared with."""
-    own = name.startswith("displacement") or name == ACCELERATION
+    own = name.startswith("displacement") or name == curves.ACCELERATION
     return name.removesuffix("_time") if own else "stress"

@@ -18,20 +18,21 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
-from foamfit.fitting.box import Space
-from foamfit.fitting.hops import ALIKE, Functions, grouped, hop
+from foamfit.fitting.box import BOX_STARTS, Reading, Space, box_starts, inner_part, thinned
 from foamfit.fitting.objective import Objective
-from foamfit.fitting.starts import BOX_STARTS, Reading, box_starts, thinned
 from foamfit.springs.model import exchanges, neighbours
 from foamfit.springs.parameters import NUISANCE
 
 Progress = Callable[[float, str], None]
+# Residual at a point of the box, and its derivative by the coordinates.
+Functions = tuple[Callable[[Array], Array], Callable[[Array], levenberg.Jacobian]]
+End = tuple[float, Array]  # cost and coordinates of the end of a descent
+Way = Callable[[Space, Array, Array, np.random.Generator], Array]  # from two points to a child
 
 PULSE = 16  # evaluations between two calls of `Tracker.pulse`
 # Fractions of the run time of a search at which its parts begin, as measured.
 DESCENTS, ON_CURVES, REFINED = 0.25, 0.75, 0.95
-# Largest number of rounds; see `_settled`.
-ATTEMPTS = 3
+ATTEMPTS = 3  # largest number of rounds; see `_settled`
 FOUND_AGAIN = 0.02  # relative difference of the costs of descents that agree on the best end
 MISSING = 0.8  # fraction of the noise floor up to which a cost is mere noise
 # Hops in a row on the curves that find nothing better, which ends them: of one spring, and where
@@ -44,6 +45,13 @@ STAGES = ((8, 0.5, 0.5), (8, 0.25, 0.25), (24, 0.25, 0.25))
 HALFWAY = STAGES[0][2]
 LEAST = 6  # descents that go on in any case
 NEAR = 1.5  # largest cost over the best one of an end that may fit almost as well
+ALIKE = 1e-3  # relative difference of the costs of descents that ended in one minimum
+# Ends that are combined, and the least relative difference of their costs; failures in a row after
+# which this stops.
+POOL, DIFFERENT, PATIENCE = 12, 0.01, 120
+# Stages of the descent from a child: iterations, relative gain at which it ends, and largest cost,
+# over the best one, with which it goes on.
+OF_CHILD = ((5, ALIKE, 5.0), (7, ALIKE, 1.5), (40, 1e-5, np.inf))
 
 
 class SearchStoppedError(Exception):
@@ -129,7 +137,7 @@ class Tracker:
     def residual(self, values: Array) -> Array:
         """Return the residual of the objective; SearchStoppedError after the time limit."""
         residual = self.consider(values)
-        if self.pulse is not None and self.objective.evaluations % PULSE == 0:
+        if self.pulse is not None and self.objective.spent.evaluations % PULSE == 0:
             self.pulse()
         if self.deadline is not None and time.monotonic() > self.deadline:
             raise SearchStoppedError
@@ -142,15 +150,15 @@ class Tracker:
 
     def possible(self, values: Array) -> Array | None:
         """Return the residual like `residual`; None if the simulation fails."""
-        failures, residual = self.objective.failures, self.residual(values)
-        return residual if self.objective.failures == failures else None
+        failures, residual = self.objective.spent.failures, self.residual(values)
+        return residual if self.objective.spent.failures == failures else None
 
     def consider(self, values: Array) -> Array:
         """Return the residual of the objective, without a time limit."""
-        failures = self.objective.failures
+        failures = self.objective.spent.failures
         residual = self.objective.residual(values)
         cost = float(residual @ residual)
-        if cost < self.best_cost and self.objective.failures == failures:
+        if cost < self.best_cost and self.objective.spent.failures == failures:
             self.best_cost, self.best_values = cost, values.copy()
             if self.better is not None:
                 self.better(self.best_values)
@@ -159,18 +167,18 @@ class Tracker:
 
 def descend(
     tracker: Tracker, space: Space, start: Array, iterations: int, enough: float = 1e-5
-) -> tuple[float, Array]:
+) -> End:
     """Descend inside the box by Levenberg-Marquardt; return cost and coordinates of the end."""
     end = levenberg.descend(*squares(tracker, space), start, space.box, iterations, enough=enough)
     return end.cost, end.point
 
 
 def halve(
-    functions: tuple[Callable[[Array], Array], Callable[[Array], levenberg.Jacobian]],
+    functions: Functions,
     box: tuple[Array, Array],
     starts: Sequence[Array],
     step: Callable[[float], None] = lambda _: None,
-) -> list[tuple[float, Array]]:
+) -> list[End]:
     """Descend from many starts by successive halving; return costs and coordinates of the ends.
 
     After each of the `STAGES` only the better part of the descents goes on (Jamieson & Talwalkar
@@ -204,20 +212,11 @@ def squares(
     return residual, jacobian
 
 
-def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[tuple[float, Array]]:
+def rank(tracker: Tracker, space: Space, points: list[Array]) -> list[End]:
     """Points of the box with their costs, cheapest first."""
-    residuals = [tracker.residual(space.decode(point)) for point in points]
-    return sorted(
-        ((float(r @ r), p) for r, p in zip(residuals, points, strict=True)), key=itemgetter(0)
-    )
-
-
-def distinct(ends: list[tuple[float, Array]]) -> list[tuple[int, Array]]:
-    """Return the distinct minima among the ends of descents, best first: count and one end each.
-
-    Ends belong to one minimum if the relative difference of their costs is below `ALIKE`.
-    """
-    return [(len(group), group[0][1]) for group in grouped(ends, ALIKE)]
+    residuals = (tracker.residual(space.decode(point)) for point in points)
+    costs = [float(residual @ residual) for residual in residuals]
+    return sorted(zip(costs, points, strict=True), key=itemgetter(0))
 
 
 def search(
@@ -239,11 +238,10 @@ def search(
     for attempt in range(attempts):
         before, counts = tracker.best_cost, dict[int, int]()
         if tracker.objective.measurement.displacement is not None and not known:
-            found = distinct(_search_loop(tracker, space, points, starts, rng, progress))
-            points = [point for _, point in found]
-            counts = {id(point): count for count, point in found}
-        ranked = rank(tracker, space, points)
-        points = [point for _, point in distinct(ranked)][:most]
+            found = grouped(_search_loop(tracker, space, points, starts, rng, progress), ALIKE)
+            points = [group[0][1] for group in found]
+            counts = {id(group[0][1]): len(group) for group in found}
+        points = [point for _, point in distinct(rank(tracker, space, points))][:most]
         for i, point in enumerate(points):
             progress(ON_CURVES + (REFINED - ON_CURVES) * i / len(points), "curves")
             cost, end = descend(tracker, space, point, 60)
@@ -282,11 +280,11 @@ def leave_minimum(
     ends += halve(functions, space.box, [space.encode(values) for values in chains])
     every = hop(space, ends, functions, rng, patience=patience)
     tracker.met += _near(space, every)
-    tracker.ends = [space.decode(group[0][1]) for group in grouped(every, ALIKE)[:MINIMA]]
+    tracker.ends = [space.decode(point) for _, point in distinct(every)[:MINIMA]]
     return [(cost, 1) for cost, _ in every[len(ends) :]]
 
 
-def _near(space: Space, ends: list[tuple[float, Array]]) -> list[Array]:
+def _near(space: Space, ends: Sequence[End]) -> list[Array]:
     """Return the parameters of the ends that may fit almost as well as the best one.
 
     None of a single spring, of which refits near the best point show what is open.
@@ -322,14 +320,11 @@ def ensure_feasible(tracker: Tracker, space: Space, rng: np.random.Generator) ->
 def _search_loop(
     tracker: Tracker, space: Space, points: list[Array], starts: int,
     rng: np.random.Generator, progress: Progress,
-) -> list[tuple[float, Array]]:  # fmt: skip
-    """Descend on the smoothed loop; return costs and ends.
-
-    Start values read off the loop are added to `points`. The best point of the loop is passed to
-    the tracker even if the search is stopped.
-    """
+) -> list[End]:  # fmt: skip
+    """Descend on the smoothed loop from `points` and from starts read off it; return the ends."""
     objective = tracker.objective
-    followed = None if objective.motion is None else objective.motion.at(objective.time)
+    motion = objective.scenes.motion
+    followed = None if motion is None else motion.at(objective.time)
     loop = thinned(objective.measurement, followed, loop=True)
     along = Objective(
         loop, objective.model, "displacement", {"stress_strain": 1.0},
@@ -358,3 +353,99 @@ def _search_loop(
         if inner.best_values is not None:
             tracker.consider(inner.best_values)
     return ends
+
+
+# ---------------------------------------------------------------- hops
+# Descents from points beside the good ends of the search, which may be in a wrong minimum. Springs
+# in series share the strain, so that a change of one moves the branches of all others, and few
+# descents from start values end in the best minimum. There the hops also combine ends.
+
+
+def grouped(ends: Sequence[End], alike: float) -> list[list[End]]:
+    """Return the ends of descents, best first, in groups whose relative cost differs by `alike`."""
+    groups: list[list[End]] = []
+    for end in sorted(ends, key=itemgetter(0)):
+        if groups and end[0] <= (1.0 + alike) * groups[-1][0][0]:
+            groups[-1].append(end)
+        else:
+            groups.append([end])
+    return groups
+
+
+def distinct(ends: Sequence[End], alike: float = ALIKE) -> list[End]:
+    """Return the distinct minima among the ends of descents, best first; see `grouped`."""
+    return [group[0] for group in grouped(ends, alike)]
+
+
+def hop(
+    space: Space, ends: Sequence[End], functions: Functions, rng: np.random.Generator,
+    patience: int = PATIENCE,
+) -> list[End]:  # fmt: skip
+    """Descend from children of the best ends until `patience` in a row are no better.
+
+    `functions` are the residual and its derivative; `WAYS`, and for springs in series `IN_SERIES`,
+    say how a child is made of two ends. Return all ends.
+    """
+    ways = *WAYS, *(IN_SERIES if space.model.has_several else ())
+    pool, failed, out = distinct(ends, DIFFERENT)[:POOL], 0, [*ends]
+    while failed < patience:
+        best = pool[0][0]
+        one, other = (pool[int(len(pool) * rng.random() ** 2)][1] for _ in range(2))
+        child = ways[rng.integers(len(ways))](space, one, other, rng)
+        failed += 1
+        if np.array_equal(child, one):
+            continue
+        at: Array | levenberg.Iterate = child
+        for iterations, enough, hopeful in OF_CHILD:
+            at = end = levenberg.descend(*functions, at, space.box, iterations, enough=enough)
+            if end.cost > hopeful * best:
+                break
+        out.append((end.cost, end.point))
+        if end.cost < (1.0 - ALIKE) * best:
+            failed = 0
+        pool = distinct([*pool, out[-1]], DIFFERENT)[:POOL]
+    return out
+
+
+def _crossed(space: Space, one: Array, other: Array, rng: np.random.Generator) -> Array:
+    """Return a point with a spring of one law of another point, in half of the cases its height."""
+    model, out, source = space.model, space.decode(one), space.decode(other)
+    to = int(rng.integers(len(model.kinds)))
+    place = int(rng.choice([i for i, law in enumerate(model.laws) if law is model.laws[to]]))
+    model.own(to, out)[:] = model.own(place, source)
+    if rng.random() < 0.5:
+        out[model.index[f"s{to + 1}_height"]] = source[model.index[f"s{place + 1}_height"]]
+    return space.encode(space.complete(out))
+
+
+def _exchanged(space: Space, one: Array, _: Array, rng: np.random.Generator) -> Array:
+    """Return a point whose springs have exchanged branches."""
+    chains = [*exchanges(space.model, space.decode(one))]
+    return space.encode(chains[rng.integers(len(chains))]) if chains else one
+
+
+def _mixed(space: Space, one: Array, other: Array, rng: np.random.Generator) -> Array:
+    """Return a point with about half of the coordinates of another."""
+    return np.where(rng.random(one.size) < 0.5, one, other)
+
+
+def _far(space: Space, one: Array, _: Array, rng: np.random.Generator) -> Array:
+    """Return a point with one coordinate anywhere in the inner part of the box."""
+    out, at, (low, high) = one.copy(), rng.integers(one.size), inner_part(space)
+    out[at] = rng.uniform(low[at], high[at])
+    return out
+
+
+def _beside(space: Space, one: Array, _: Array, rng: np.random.Generator) -> Array:
+    """Return a point with about half of the coordinates changed, within the inner part of the box.
+
+    Further out lie stiff springs, which take long and need the implicit method.
+    """
+    low, high = inner_part(space)
+    far = 10.0 ** rng.uniform(-2.0, -0.5) * (high - low) * rng.standard_normal(one.size)
+    far *= rng.random(one.size) < 0.5
+    return np.asarray(np.clip(one + far, np.minimum(low, one), np.maximum(high, one)))
+
+
+WAYS: tuple[Way, ...] = _mixed, _far, _beside
+IN_SERIES: tuple[Way, ...] = _crossed, _exchanged

@@ -1,15 +1,17 @@
 """The fit of several tests with linked parameters.
 
-The residuals of all tests, each in units of its own noise, are minimised as one sum of squares. A
-parameter has one value for all tests or one per test, scatters about a common value, or follows a
-rate law (`fitting.links`).
+The residuals of all tests, each in units of its own noise, are minimised as one sum of squares.
+
+A parameter is shared (one value), own (one value per test), scattering (one value per test,
+log-normal about a common value), or follows a rate law with a common value v and slope b: with
+x = ln(rate/rate0) of a test, v·(1 + b x) or v·(rate/rate0)^b = v·e^(b x).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -20,9 +22,9 @@ from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting import levenberg
 from foamfit.fitting.box import Scales, Space
-from foamfit.fitting.links import RATES, STEEPEST, Links, factor, start_of
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.problem import Problem
+from foamfit.options import POWER_RATE, RATES
 from foamfit.springs.parameters import NUISANCE
 
 # A descent ends after two consecutive steps with less than this relative gain, or after ITERATIONS.
@@ -31,15 +33,76 @@ ENOUGH, ITERATIONS = 1e-5, 80
 BLOCKS = 50
 # Least value whose logarithm is taken, and the largest logarithm.
 _TINY, _FAR = 1e-30, 100.0
+LEAST_FACTOR = 1e-6  # smallest factor 1 + b x, below which the law has no positive value
+STEEPEST = 5.0  # largest absolute slope of a rate law
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """The links between the parameters of n tests.
+
+    `kinds` gives one of `KINDS` for each named parameter; all others are own. `log_rates` (n,) are
+    ln(rate/rate0), needed for rate laws. `pulls` (n,) of a scattering parameter are the square
+    roots of the weights of (ln v - ln common value)²; parameters without an entry have no such
+    term.
+    """
+
+    kinds: Mapping[str, str]
+    log_rates: Array | None = None
+    pulls: Mapping[str, Array] = field(default_factory=dict)
+
+    def kind(self, name: str) -> str:
+        """Return the kind of a parameter."""
+        return self.kinds.get(name, "own")
+
+    def x(self, test: int) -> float:
+        """Return ln(rate/rate0) of a test; 0 if no rates are known."""
+        return 0.0 if self.log_rates is None else float(self.log_rates[test])
+
+    def having(self, **kinds: str) -> Links:
+        """Return links with some kinds replaced."""
+        return replace(self, kinds={**self.kinds, **kinds})
+
+    def of(self, tests: list[int]) -> Links:
+        """Return the links of a subset of the tests."""
+        rates = None if self.log_rates is None else self.log_rates[tests]
+        pulls = {name: pull[tests] for name, pull in self.pulls.items()}
+        return replace(self, log_rates=rates, pulls=pulls)
+
+
+def factor(kind: str, b: float, x: float) -> tuple[float, float]:
+    """Return value over common value at x = ln(rate/rate0), and its derivative by b."""
+    if kind == POWER_RATE:
+        value = float(np.exp(b * x))
+        return value, x * value
+    value = 1.0 + b * x
+    return (value, x) if value > LEAST_FACTOR else (LEAST_FACTOR, 0.0)
+
+
+def start_of(kind: str, values: Array, x: Array) -> tuple[float, float]:
+    """Return the common value and slope of the rate law fitted to the values of some tests.
+
+    If the law cannot describe the values, their median and slope zero are returned.
+    """
+    middle = float(np.median(values))
+    if not np.ptp(x) > 0.0:
+        return middle, 0.0
+    if kind == POWER_RATE and np.all(values > 0.0):
+        slope, level = np.polyfit(x, np.log(values), 1)
+        v = float(np.exp(level))
+    else:
+        slope, v = np.polyfit(x, values, 1)
+        slope = slope / v if v else 0.0
+    slope = float(np.clip(slope, -STEEPEST, STEEPEST))
+    if not np.isfinite(v) or v == 0.0 or min(factor(kind, slope, one)[0] for one in x) <= 1e-3:
+        return middle, 0.0
+    return float(v), slope
 
 
 def _by_rate(
     kind: str, x: float, logarithmic: bool, v: float, b: float
 ) -> tuple[float, float, float]:
-    """Return a coordinate that follows a rate law, and its derivatives by v and b.
-
-    v is the coordinate at rate0; it may be the logarithm of the parameter.
-    """
+    """Return a coordinate that follows a rate law, v at rate0, and its derivatives by v and b."""
     f, slope = factor(kind, b, x)
     return (v + math.log(f), 1.0, slope / f) if logarithmic else (v * f, f, v * slope)
 
@@ -87,9 +150,9 @@ class Term:
 
     def residual_at(self, point: Array) -> Array:
         """Return the residual of the test, then of the pulls; infinite if the simulation fails."""
-        values, failures = self.values(point), self.objective.failures
+        values, failures = self.values(point), self.objective.spent.failures
         found = self.objective.residual(values)
-        if self.objective.failures > failures:
+        if self.objective.spent.failures > failures:
             found = np.full(found.size, np.inf)
         off = self.weights * (_logarithm(values[self.pulled]) - point[self.commons])
         return np.append(found, off)
@@ -201,12 +264,9 @@ def fit_linked(
     start can be simulated.
     """
     layout = Layout.of(tuple(problems), links)
-    functions = layout.residual, layout.jacobian
-    ends = [
-        levenberg.descend(*functions, start, layout.box, iterations, enough=ENOUGH)
-        for start in map(layout.start, starts)
-        if np.all(np.isfinite(layout.residual(start)))
-    ]
+    given, box = (layout.residual, layout.jacobian), layout.box
+    points = [p for p in map(layout.start, starts) if np.isfinite(layout.residual(p)).all()]
+    ends = [levenberg.descend(*given, p, box, iterations, enough=ENOUGH) for p in points]
     if not ends:
         raise SimulationError(
             f"{problems[0].measurement.name}: no start of the fit of {len(problems)} tests can be "
@@ -280,15 +340,19 @@ class Layout:
         own = tuple(name for name in names if kinds[name] in ("own", "scatter"))
         shared = {name for name in names if kinds[name] == "shared"}
         rated = {name for name in names if kinds[name] in RATES}
-        parents = {n: _parents(problems[0], n) & set(names) for n in names if n not in own}
-        absolute = tuple(n for n, of in parents.items() if of - shared or (of and n in rated))
+        absolute = []
+        for name in names:  # its coordinate may depend on parameters that are not shared
+            of = () if name in NUISANCE else problems[0].model.param(name).of
+            parents = {f"{name.partition('_')[0]}_{short}" for short in of} & set(names)
+            if name not in own and (parents - shared or (parents and name in rated)):
+                absolute.append(name)
         places, count = dict[str, int](), 0
         for name in names:
             if kinds[name] != "own":
                 places[name] = count
                 count += 2 if name in rated else 1
         terms = list[Term]()
-        pairs = zip(problems, _spaces(problems, absolute), strict=True)
+        pairs = zip(problems, _spaces(problems, tuple(absolute)), strict=True)
         for t, (problem, space) in enumerate(pairs):
             at, rates = list[int](), dict[int, partial[tuple[float, float, float]]]()
             coordinates = {problem.names[one.place]: one for one in space.coordinates}
@@ -350,12 +414,12 @@ class Layout:
                 values = [vectors[t][self.problems[t].index[name]] for t in free]
                 point[place] = np.median(_logarithm(np.array(values)))
                 continue
-            columns = [self.terms[t].names.index(name) for t in free]
-            own = np.array([found[t][j] for t, j in zip(free, columns, strict=True)])
+            columns = {t: self.terms[t].names.index(name) for t in free}
+            own = np.array([found[t][j] for t, j in columns.items()])
             if (kind := links.kind(name)) not in RATES:
                 point[place] = np.median(own)
                 continue
-            logarithmic = self.terms[free[0]].space.coordinates[columns[0]].is_logarithmic
+            logarithmic = self.terms[free[0]].space.coordinates[columns[free[0]]].is_logarithmic
             x = np.array([links.x(t) for t in free])
             v, b = start_of(kind, np.exp(own) if logarithmic else own, x)
             point[place : place + 2] = np.log(v) if logarithmic else v, b
@@ -365,25 +429,16 @@ class Layout:
         """Return the common values at a point, SI; see `Together.common`."""
         out = dict[str, tuple[float, ...]]()
         for name, place in self.common_places.items():
-            if name in self.own:
-                out[name] = (float(np.exp(point[place])),)
-                continue
             t = next(t for t, problem in enumerate(self.problems) if name in problem.free())
             value, kind = float(values[t][self.problems[t].index[name]]), self.links.kind(name)
-            if kind not in RATES:
-                out[name] = (value,)
-                continue
-            b = float(point[place + 1])
-            out[name] = value / factor(kind, b, self.links.x(t))[0], b
+            if kind in RATES:
+                b = float(point[place + 1])
+                out[name] = value / factor(kind, b, self.links.x(t))[0], b
+            else:
+                out[name] = (float(np.exp(point[place])) if name in self.own else value,)
         return out
 
 
 def _logarithm(values: Array) -> Array:
     """Return the logarithms of the absolute values of parameters."""
     return np.log(np.maximum(np.abs(values), _TINY))
-
-
-def _parents(problem: Problem, name: str) -> set[str]:
-    """Return the parameters on which the coordinate of a parameter depends."""
-    of = () if name in NUISANCE else problem.model.param(name).of
-    return {f"{name.partition('_')[0]}_{parent}" for parent in of}

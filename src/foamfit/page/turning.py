@@ -13,9 +13,9 @@ from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError
+from foamfit.fitting.box import Reading, thinned
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import Tracker, rank
-from foamfit.fitting.starts import Reading, thinned
 from foamfit.one_model import Options
 from foamfit.options import Keywords
 from foamfit.parts import law_in_words

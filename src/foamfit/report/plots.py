@@ -18,7 +18,7 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of
 from foamfit.errors import InputError
-from foamfit.fitting.links import RATES
+from foamfit.options import RATES
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, INSIDE, TWO, VERMILION
 from foamfit.report.panels import Line, Panel, annotate, draw, draw_below, is_known, panels_of, size

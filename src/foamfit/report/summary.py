@@ -12,8 +12,8 @@ import numpy as np
 from foamfit.data.energy import EnergyAudit, largest_motion, noise_sentences
 from foamfit.data.measurement import UNITS, Measurement, Striker, interior_channel
 from foamfit.data.zeros import CONTRADICTED
-from foamfit.fitting.branches import covered
 from foamfit.fitting.nuisance import POSITIVE
+from foamfit.parts import covered
 from foamfit.report import render
 from foamfit.report.figures import images
 from foamfit.report.plots import origin_word

@@ -27,17 +27,16 @@ from foamfit.data.rig import Candidate, Rig
 from foamfit.errors import SimulationError
 from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
-from foamfit.fitting.links import Links
-from foamfit.fitting.minima import in_order, joint_minima
 from foamfit.fitting.problem import Problem
-from foamfit.fitting.together import Layout, Together, fit_linked
+from foamfit.fitting.together import Layout, Links, Together, fit_linked
 from foamfit.springs.model import exchanges
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study import gain
 from foamfit.study.gain import Draw, Known, Other, Test
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import NOTHING, WEAK
-from foamfit.trust.ranges import ALIKE
+from foamfit.trust.refits import ALIKE
+from foamfit.trust.settle import in_order, joint_minima
 
 TRIES = 60  # attempts per draw
 FROM = 3  # number of minima from which springs with fewer branches are sought
@@ -123,9 +122,8 @@ def _held(tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[str])
     """Return the problems of some tests in which parameters of unreached branches are held."""
     seen, out = _reached(tests, vectors, names), list[Problem]()
     for problem, values in zip((one.problem for one in tests), vectors, strict=True):
-        for name in np.array(names)[~seen].tolist():
-            problem = problem.holding(name, float(values[problem.index[name]]))
-        out.append(problem)
+        lost = np.array(names)[~seen].tolist()
+        out.append(problem.holding({name: float(values[problem.index[name]]) for name in lost}))
     return out
 
 

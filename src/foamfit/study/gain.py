@@ -3,7 +3,7 @@
 A fit with residuals r, slopes J and noise of covariance Σ has the covariance H⁻¹ (JᵀΣJ) H⁻¹ with
 H = JᵀJ (`trust.covariance`), with contact time and zeros eliminated from J. H and JᵀΣJ of several
 tests add up. Where the law misses the record, the range due to model error is expected by the rule
-of `trust.ranges`: all values whose cost rises by at most `tolerance`, to first order, times the
+of `trust.refits`: all values whose cost rises by at most `tolerance`, to first order, times the
 factor by which the ranges of the tests at hand exceed this.
 """
 
@@ -23,7 +23,6 @@ from foamfit.data.measurement import Measurement
 from foamfit.data.rig import Candidate, Rig
 from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError, SimulationError
-from foamfit.fitting.branches import unreached
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem, make_params, make_problem
 from foamfit.report.plan import Expected
@@ -31,10 +30,11 @@ from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Impact
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study.identified import NORMAL
+from foamfit.trust.best_point import unreached
 from foamfit.trust.checklist import may_vanish
 from foamfit.trust.covariance import NOTHING, WEAK
 from foamfit.trust.intervals import FAR, HARDLY_WORSE
-from foamfit.trust.ranges import ALIKE
+from foamfit.trust.refits import ALIKE
 
 TINY, ROUNDING = 1e-6, 1e-12  # least information on a scaled parameter, and over the largest one
 LONGEST = 30.0  # longest contact, in times that the striker takes over the height of the specimen

@@ -24,9 +24,9 @@ from foamfit.data.measurement import Specimen
 from foamfit.errors import InputError
 from foamfit.files import read_whole, reason
 from foamfit.fitting.box import is_logarithmic
-from foamfit.fitting.links import KINDS, RATES, factor
 from foamfit.fitting.nuisance import TIME_SHIFT
-from foamfit.options import DRIVES
+from foamfit.fitting.together import factor
+from foamfit.options import DRIVES, KINDS, RATES
 from foamfit.parts import Pair, ParameterEstimate
 from foamfit.report.folder import SAMPLES, Result, load_result, read_samples
 from foamfit.report.listing import read_table

@@ -20,12 +20,12 @@ from foamfit.data.cycles import loading_rate
 from foamfit.data.measurement import Measurement
 from foamfit.errors import InputError, SimulationError, naming
 from foamfit.fitting.curves import choose_drive
-from foamfit.fitting.links import KINDS, RATES, Links
 from foamfit.fitting.objective import Spent
 from foamfit.fitting.problem import Problem, fix_and_vary, make_params
 from foamfit.fitting.search import Tracker, descend
-from foamfit.fitting.together import Together, fit_linked
+from foamfit.fitting.together import Links, Together, fit_linked
 from foamfit.one_model import Options, Progress, identify
+from foamfit.options import KINDS, RATES
 from foamfit.springs.model import Model
 from foamfit.study.joint_fit import Vectors, fit_jointly
 from foamfit.study.joint_result import Alternative, JointResult, result_of

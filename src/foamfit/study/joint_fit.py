@@ -3,7 +3,7 @@
 The best values of a scattering parameter in the tests, its common value and its spread depend on
 each other. For a given spread, a fit pulls the values towards the common value. The values without
 this pull follow from the curvature of the cost, and give common value and spread
-(`trust.scatter`). This is repeated until the spread no longer changes (Laplace's method).
+(`trust.joint_point`). This is repeated until the spread no longer changes (Laplace's method).
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ import numpy as np
 from foamfit.arrays import Array
 from foamfit.errors import SimulationError
 from foamfit.fitting.box import is_logarithmic
-from foamfit.fitting.links import RATES, Links
-from foamfit.fitting.minima import joint_minima
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.search import Tracker
-from foamfit.fitting.together import Together, fit_linked
+from foamfit.fitting.together import Links, Together, fit_linked
+from foamfit.options import RATES
 from foamfit.parts import ParameterEstimate
 from foamfit.springs.parameters import NUISANCE, split_name, unit_of
 from foamfit.text import counted
@@ -31,11 +30,10 @@ from foamfit.trust.best_point import BestPoint
 from foamfit.trust.budget import Settled, judged, settle
 from foamfit.trust.covariance import Ends
 from foamfit.trust.intervals import FAR, HARDLY_WORSE
-from foamfit.trust.joint_point import Error, JointPoint
-from foamfit.trust.profile import PLACED
-from foamfit.trust.ranges import ITERATIONS, TRIALS, left_open, nearer, tolerance
-from foamfit.trust.residuals.law_error import CurveError
-from foamfit.trust.scatter import Spread, common_and_spread, correlation
+from foamfit.trust.joint_point import Error, JointPoint, Spread, common_and_spread, correlation
+from foamfit.trust.refits import ITERATIONS, PLACED, TRIALS, left_open, nearer, tolerance
+from foamfit.trust.residuals import CurveError
+from foamfit.trust.settle import joint_minima
 
 ROUNDS = 12  # most iterations between best values and spreads
 STILL = 0.01  # relative change of the spreads at which these iterations end
@@ -146,7 +144,7 @@ def correlation_of(
 
     It is the correlation of logarithms for parameters with `is_logarithmic`; `undrawn` are the
     logarithms of scattering parameters. Only tests that determine all of these parameters are used;
-    see `trust.scatter.correlation`.
+    see `trust.joint_point.correlation`.
     """
     found, columns, scales = point.found, dict[str, Array](), list[Array]()
     for name in found.own:
@@ -180,7 +178,7 @@ def ranges_of(point: JointPoint) -> tuple[dict[str, Ends], list[Together]]:
     A range is the hull of two: the 95 % interval of a value found from the same number of other
     specimens, from fits without each test in turn (a jackknife of n <= `GROUPS` groups, with
     Student's t of n - 1 degrees of freedom); and shared values that fit almost equally well
-    (`trust.ranges`), with the fits at their ends. Empty if there is only noise.
+    (`trust.refits`), with the fits at their ends. Empty if there is only noise.
     """
     refits = list[Together]()
     if not point.uncertainty.errs:
@@ -200,12 +198,11 @@ def ranges_of(point: JointPoint) -> tuple[dict[str, Ends], list[Together]]:
 def own_ranges(point: JointPoint, refits: Sequence[Together]) -> tuple[dict[str, Ends], ...]:
     """Return the ranges due to model error of the values that each test has for itself."""
     # The hull of values that fit the test almost equally well with the same shared values
-    # (`trust.ranges`), and of those in the `refits` with other shared values.
+    # (`trust.refits`), and of those in the `refits` with other shared values.
     out = []
     for t, best in enumerate(point.bests):
-        problem = best.problem
-        for name in (name for name in best.names if name in point.found.shared):
-            problem = problem.holding(name, best.value(name))
+        shared = {name: best.value(name) for name in best.names if name in point.found.shared}
+        problem = best.problem.holding(shared)
         alone = BestPoint(problem, best.values)
         found = left_open(alone, (), Tracker(problem.objective), descents=False).ranges
         for name, ends in found.items():
@@ -258,7 +255,7 @@ def _held(point: JointPoint, name: str, sign: float) -> Together | None:
         if end == value:
             break
         start = point.moved(name, end - value)
-        problems = [problem.holding(name, end) for problem in found.problems]
+        problems = [problem.holding({name: end}) for problem in found.problems]
         try:
             other = fit_linked(problems, found.links, [start], iterations=ITERATIONS)
         except SimulationError:

@@ -14,9 +14,9 @@ import numpy as np
 from foamfit.api import FitResult
 from foamfit.arrays import Array
 from foamfit.codec import plain
-from foamfit.fitting.links import RATES
 from foamfit.fitting.search import SearchRecord
 from foamfit.fitting.together import Together
+from foamfit.options import RATES
 from foamfit.parts import OfLaw, ParameterEstimate
 from foamfit.report import figures, render
 from foamfit.report.folder import Result, brief, write_json, write_result, write_text

@@ -209,7 +209,7 @@ def _before(problem: Problem, source: Source) -> Problem:
     channels = map(channel_of, objective.counted)
     sampled = {channel: before & test.sampled.get(channel, True) for channel in channels}
     test = replace(test, sampled=test.sampled | sampled)
-    followed = (objective.motion,)
+    followed = (objective.scenes.motion,)
     return replace(problem, objective=replace(objective, measurement=test, followed=followed))
 
 

@@ -14,8 +14,7 @@ from typing import Any
 from foamfit.data import toml_file
 from foamfit.data.toml_file import Check, Rule, checked, motion_file, table_of
 from foamfit.errors import InputError, naming
-from foamfit.fitting.links import KINDS
-from foamfit.options import FREED, OF_FIT
+from foamfit.options import FREED, KINDS, OF_FIT
 from foamfit.report.folder import FILES
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
@@ -59,7 +58,7 @@ class Study:
     model: str
     relaxation: int
     drive: str | None
-    kinds: Mapping[str, str]  # by parameter, one of `links.KINDS` or "auto"
+    kinds: Mapping[str, str]  # by parameter, one of `options.KINDS` or "auto"
     held: Mapping[str, float]  # values of fixed parameters, SI
     seed: int = 0
     cycle: int | None = None

@@ -3,9 +3,9 @@
 After the search, `settle` decides which nuisance parameters stay free, and weighs the residuals.
 `best_point` contains the curves, residuals and slopes at the best point (`joint_point` that of
 several tests); `residuals` separates noise from model error; `covariance` and `intervals` compute
-the uncertainty due to noise, `ranges` that due to model error; `checklist` tests the quality of a
-fit; `conclude` assembles the result and gives each parameter its state. All sentences are in
-`sentences.toml`. A newcomer may skip `profile` and `evidence`.
+the uncertainty due to noise, `refits` profiles and the ranges due to model error; `checklist` tests
+the quality of a fit; `conclude` assembles the result and gives each parameter its state. All
+sentences are in `sentences.toml`. A newcomer may skip `refits` and `evidence`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,8 @@ from foamfit import text
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-SENTENCES: dict[str, Any] = tomllib.loads(
-    files(__package__).joinpath("sentences.toml").read_text(encoding="utf-8")
-)
+_TEXT = files(__package__).joinpath("sentences.toml").read_text(encoding="utf-8")
+SENTENCES: dict[str, Any] = tomllib.loads(_TEXT)
 
 
 @cache

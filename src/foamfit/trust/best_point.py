@@ -6,7 +6,7 @@ with sensitivities.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,14 +18,14 @@ from foamfit.arrays import Array
 from foamfit.data.calibration import Contradiction, contradictions
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import FROM_VELOCITY
-from foamfit.fitting.branches import silent, unreached
 from foamfit.fitting.nuisance import CONTACT_TIME, POSITIVE, TIME_SHIFT, open_zero
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem
+from foamfit.parts import covered
+from foamfit.springs.parameters import split_name
 from foamfit.trust import covariance
 from foamfit.trust.covariance import Block, Covariance, Ends, Uncertainty
-from foamfit.trust.residuals.law_error import CurveError, curve_errors
-from foamfit.trust.residuals.noise_process import basis_of, parts
+from foamfit.trust.residuals import CurveError, basis_of, curve_errors, parts
 
 # Largest leverage of a cycle along a direction; at 1 its residual would be zero there.
 MOST_TAKEN = 0.99
@@ -69,8 +69,12 @@ class BestPoint:
         """Names of the k parameters on which the curves depend."""
         if self.chosen is not None:
             return self.chosen
-        without = silent(self.problem, self.simulated, self.unreached)
-        return tuple(name for name in self.problem.free() if name not in without)
+        seen, model = visited(self.problem, self.simulated), self.problem.model
+
+        def moves(name: str) -> bool:
+            return model.param(name).moves in covered(seen[name.partition("_")[0]])
+
+        return tuple(n for n in self.problem.free() if n not in self.unreached or moves(n))
 
     @property
     def index(self) -> dict[str, int]:
@@ -309,9 +313,8 @@ def cycle_growth(best: BestPoint) -> float | None:
         return None
     last = spans[max(spans)]
     kept = np.concatenate([objective.kept[name] for name in objective.counted])
-    return growth(
-        best.jacobian, best.residual, np.flatnonzero((kept >= last.start) & (kept < last.stop))
-    )
+    rows = np.flatnonzero((kept >= last.start) & (kept < last.stop))
+    return growth(best.jacobian, best.residual, rows)
 
 
 def growth(jacobian: Array, residual: Array, rows: NDArray[np.intp]) -> float:
@@ -325,3 +328,63 @@ def growth(jacobian: Array, residual: Array, rows: NDArray[np.intp]) -> float:
     onto, share, _ = np.linalg.svd(basis_of(jacobian)[rows], full_matrices=False)
     hat, left = np.minimum(share**2, MOST_TAKEN), residual[rows]
     return float(2.0 * hat / (1.0 - hat) @ (onto.T @ left) ** 2 / max(left @ left, 1e-300))
+
+
+# ---------------------------------------------------------------- branches along a run
+
+
+def visited(problem: Problem, simulated: Simulated) -> dict[str, tuple[str, ...]]:
+    """Return the branches that each spring has visited, in the order of the first visit.
+
+    Each spring starts at rest, even if it is on another branch at the first sample.
+    """
+    laws = problem.model.laws
+    seen = [[next(iter(law.branches))] for law in laws]
+    for _, spring, *numbers, _ in simulated.motion.switches:
+        seen[int(spring)] += [laws[int(spring)].named_branch(int(number)) for number in numbers]
+    return {f"s{i}": tuple(dict.fromkeys(names)) for i, names in enumerate(seen, 1)}
+
+
+def unreached(problem: Problem, simulated: Simulated) -> dict[str, str]:
+    """Return the parameters without a prior whose branch was never reached, and that branch."""
+    seen = {spring: covered(names) for spring, names in visited(problem, simulated).items()}
+    known = {one.name for one in problem.objective.priors}
+    own = [n for n in problem.model.names if n not in known and split_name(n)[0] >= 0]
+    branches = {name: problem.model.param(name).branch for name in own}
+    return {n: b for n, b in branches.items() if b and b not in seen[n.partition("_")[0]]}
+
+
+def _along(
+    problem: Problem, simulated: Simulated, words: Callable[[dict[int, str]], str]
+) -> NDArray[np.object_]:
+    """Return `words` for the branches of the hysteretic springs (0 = base) at each sample, (n,)."""
+    laws, clock = problem.model.laws, problem.objective.time
+    state = {i: next(iter(law.branches)) for i, law in enumerate(laws) if law.hysteretic}
+    out = np.full(clock.size, words(state), dtype=object)
+    for when, spring, _, entered, _ in simulated.motion.switches:
+        if int(spring) in state:
+            state[int(spring)] = laws[int(spring)].named_branch(int(entered))
+            out[int(np.searchsorted(clock, when)) :] = words(state)
+    return out
+
+
+def sections(problem: Problem, simulated: Simulated) -> list[str]:
+    """Return the branches at each sample, base first ("d", "a·c"), or free flight."""
+    out = _along(problem, simulated, lambda state: "·".join(state.values()) or "line")
+    if np.isfinite(end := simulated.motion.contact_end):
+        out[int(np.searchsorted(problem.objective.time, end, side="right")) :] = "free flight"
+    return list(map(str, out))
+
+
+def branch_of_samples(problem: Problem, simulated: Simulated) -> NDArray[np.str_]:
+    """Return the branches of the springs at each sample in words, (n,).
+
+    For example "loading, spring 1 on d". Loading ends at the peak of the measured stress.
+    """
+
+    def words(state: dict[int, str]) -> str:
+        return " and ".join(f"spring {i + 1} on {branch}" for i, branch in state.items())
+
+    loading = np.arange(problem.objective.time.size) <= np.argmax(problem.measurement.stress)
+    ways = np.where(loading, "loading, ", "unloading, ").astype(object)
+    return np.asarray(ways + _along(problem, simulated, words), dtype=str)

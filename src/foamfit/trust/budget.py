@@ -36,8 +36,7 @@ from foamfit.trust.covariance import Ends
 STEP = 1e-4
 # Changes of parameters below this share of the largest one, all over their scales, are rounding.
 ROUNDING = 1e-6
-# A force whose zero is known no better than this share of its peak is doubtful.
-DOUBTFUL = 0.005
+DOUBTFUL = 0.005  # a force whose zero is known no better than this share of its peak is doubtful
 # Nuisance parameters by the source of uncertainty to which they contribute.
 _CONTACT = (nuisance.CONTACT_TIME, *nuisance.ZEROS)
 _STRIKER = (*nuisance.POSITIVE, nuisance.TIME_SHIFT)
@@ -62,11 +61,8 @@ def responses(best: BestPoint) -> dict[str, Array]:
     """
     measurement, free = best.problem.measurement, {"delay", *best.problem.free()}
     free |= {"stress_scale"} if nuisance.FORCE_SCALE in free else set()
-    return {
-        quantity: response(best, quantity, sigma / _value(measurement, quantity))
-        for quantity, sigma in measurement.uncertainties.items()
-        if quantity not in free
-    }
+    known = {name: sigma for name, sigma in measurement.uncertainties.items() if name not in free}
+    return {name: response(best, name, s / _value(measurement, name)) for name, s in known.items()}
 
 
 def _value(test: Measurement, quantity: str) -> float:
@@ -101,11 +97,7 @@ def response(best: BestPoint, quantity: str, share: float) -> Array:
 
 
 def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array]:
-    """Return the parameters and the residual after a relative change of a quantity.
-
-    Only parameters that are the quantity itself change. Raises SimulationError if the test cannot
-    be simulated.
-    """
+    """Return the parameters, of which those of the quantity itself change, and the residual."""
     problem, values = best.problem, best.values.copy()
     test = changed(problem.measurement, quantity, share)
     if quantity.startswith("height"):  # a spring's own ± has precedence over that of the specimen
@@ -118,7 +110,7 @@ def _changed(best: BestPoint, quantity: str, share: float) -> tuple[Array, Array
         values[best.index[quantity]] *= 1.0 + share
     before = problem.objective
     same = test.displacement is before.measurement.displacement  # not to be smoothed again
-    objective = replace(before, measurement=test, followed=(before.motion,) if same else ())
+    objective = replace(before, measurement=test, followed=(before.scenes.motion,) if same else ())
     return values, objective.compare(objective.simulate(values), values)
 
 

@@ -16,36 +16,32 @@ from foamfit.data.energy import EnergyAudit
 from foamfit.data.measurement import INTEGRATED, is_clipped
 from foamfit.data.zeros import CONTRADICTED
 from foamfit.errors import InputError
-from foamfit.fitting.branches import covered, visited
 from foamfit.fitting.curves import check_time_shift
 from foamfit.fitting.levenberg import descend
 from foamfit.fitting.nuisance import TIME_SHIFT
 from foamfit.fitting.search import SearchRecord, Tracker, squares
-from foamfit.parts import ParameterEstimate
+from foamfit.parts import ParameterEstimate, covered
 from foamfit.results import Check, Intervals
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 from foamfit.text import ASKED
 from foamfit.trust import SENTENCES, say
-from foamfit.trust.best_point import BestPoint
+from foamfit.trust.best_point import BestPoint, visited
 from foamfit.trust.covariance import WEAK, covariance
 
 # A fit is unacceptable if the misfit of a curve exceeds this multiple of its standard deviation.
 UNACCEPTABLE = 0.5
-# A fit is poor if the misfit of a curve exceeds this share of its range.
-POOR = 0.05
+POOR = 0.05  # a fit is poor if the misfit of a curve exceeds this share of its range
 # Largest ratio of residuals to noise that still counts as noise: a stated noise is seldom accurate
 # to better than 10 %, an estimated one to better than 50 %.
 STATED, ESTIMATED = 1.1, 1.5
-# Relative fall of the misfit by free contact and zeros that is not due to noise.
-BOUGHT = 0.02
+BOUGHT = 0.02  # relative fall of the misfit by free contact and zeros that is not due to noise
 # The curves contradict a prior if they differ by more than this many standard deviations of both.
 AGAINST = 3.0
 ALONE = 60  # iterations of a descent without a prior
 # The stress is gone below this share of its peak, and a specimen has recovered below this share of
 # the largest strain.
 GONE, RECOVERED = 0.02, 0.5
-# Residuals are correlated if their autocorrelation time, in samples, exceeds this.
-STRUCTURED = 5.0
+STRUCTURED = 5.0  # residuals are correlated if their autocorrelation time, in samples, exceeds this
 # Largest number of reasons in a warning; more are easier to read in the table of parameters.
 REASONS = 3
 
@@ -92,7 +88,7 @@ def make_checklist(
         _visited(best, estimates),
         *_of_intervals(best, estimates, intervals, with_error),
         *_of_priors(best, estimates, with_error),
-        *_recovery(best),
+        *([_check("recovery", False, lost=lost)] if (lost := lost_height(best)) else ()),
         *_of_test(best, balance),
         _time_shift(best, estimates),
         _damping(best),
@@ -114,11 +110,11 @@ def _check(key: str, answer: bool | None, *, fatal: bool = False, **facts: Any) 
 
 def _of_search(best: BestPoint, record: SearchRecord) -> Iterator[Check]:
     by, objective = record.stopped, best.problem.objective
-    yield _check("ended", by is None, by=by, count=objective.evaluations)
+    yield _check("ended", by is None, by=by, count=objective.spent.evaluations)
     total = record.descents
     agreeing = record.agreeing if by is None and total else 0
     yield _check("agree", agreeing > 1 if agreeing else None, total=total, agreeing=agreeing)
-    failed, tried = objective.failures, max(objective.evaluations, 1)
+    failed, tried = objective.spent.failures, max(objective.spent.evaluations, 1)
     yield _check("simulated", failed <= 0.5 * tried, failed=failed, tried=tried)
     vibrates = objective.interior_mass and len(best.problem.model.kinds) > 1
     yield _check("vibration", not vibrates)
@@ -184,10 +180,7 @@ def _of_record(best: BestPoint, estimates: Estimates, record: SearchRecord) -> C
 
 
 def _determined(best: BestPoint, estimates: Estimates) -> Check:
-    """Check whether the springs' parameters are determined, or zero with a small upper bound.
-
-    An undetermined nuisance parameter widens the intervals of the others.
-    """
+    """Check whether the springs' parameters are determined, or zero with a small upper bound."""
     own = {name: item for name, item in estimates.items() if name not in NUISANCE}
     vanishing, reasons_of = [name for name in own if _vanishes(best, name, own[name])], {}
     for state in ("not determined", "weak"):
@@ -211,16 +204,12 @@ def _vanishes(best: BestPoint, name: str, item: ParameterEstimate) -> bool:
 def _visited(best: BestPoint, estimates: Estimates) -> Check:
     needed = [law.needed for law in best.problem.model.laws]
     seen = visited(best.problem, best.simulated)
-    absent = {
-        spring: [branch for branch in branches if branch not in covered(seen[spring])]
-        for spring, branches in zip(seen, needed, strict=True)
-    }
+    pairs = zip(seen, needed, strict=True)
+    absent = {s: [one for one in needs if one not in covered(seen[s])] for s, needs in pairs}
     lost = [f"{branch} of {spring}" for spring, gone in absent.items() for branch in gone]
     # An absent branch is a fault only if a varied parameter, which has its own warning, needs it.
-    depend = any(
-        item.state == "not determined" and absent.get(f"s{split_name(name)[0] + 1}")
-        for name, item in estimates.items()
-    )
+    unknown = [name for name, item in estimates.items() if item.state == "not determined"]
+    depend = any(absent.get(f"s{split_name(name)[0] + 1}") for name in unknown)
     answer = True if not lost else False if depend else None
     every = tuple(dict.fromkeys(chain.from_iterable(needed)))
     return _check("visited", answer, wanted=every, lost=lost)
@@ -300,10 +289,7 @@ def _of_test(best: BestPoint, balance: EnergyAudit) -> Iterator[Check]:
 
 
 def _damping(best: BestPoint) -> Check:
-    """Check whether a driven single spring clearly lacks the damping (Pa·s) that was left out.
-
-    Friction in the rig (Pa) looks much like it.
-    """
+    """Check whether a driven single spring lacks damping; friction in the rig looks like it."""
     problem, name = best.problem, "s1_eta"
     if problem.objective.drive == "impact" or not best.names:
         return _check("damping", None)
@@ -339,12 +325,6 @@ def lost_height(best: BestPoint) -> float:
         return 0.0
     share = float(test.displacement[last] / test.displacement.max())
     return share if share > RECOVERED else 0.0
-
-
-def _recovery(best: BestPoint) -> Iterator[Check]:
-    """Check whether the specimen follows the motion back."""
-    if lost := lost_height(best):
-        yield _check("recovery", False, lost=lost)
 
 
 def _time_shift(best: BestPoint, estimates: Estimates) -> Check:

@@ -16,33 +16,22 @@ from foamfit.data.energy import audit, noise_sentences
 from foamfit.data.measurement import INTEGRATED, Measurement, interior_channel
 from foamfit.data.zeros import UNDER_LOAD
 from foamfit.errors import SimulationError
-from foamfit.fitting.branches import visited
 from foamfit.fitting.curves import MOTION_CURVES
 from foamfit.fitting.nuisance import TIME_SHIFT
-from foamfit.fitting.objective import MODEL_ERROR, Effort
+from foamfit.fitting.objective import MODEL_ERROR
 from foamfit.fitting.search import SearchRecord
 from foamfit.parts import ParameterEstimate
 from foamfit.results import Correlation, Curves, Fit, Intervals, Switch
 from foamfit.solve.cache import SPENT
 from foamfit.springs.parameters import NUISANCE, any_param, split_name, unit_of
 from foamfit.text import engineering
-from foamfit.trust import covariance, say
-from foamfit.trust.best_point import BestPoint, cycle_growth
+from foamfit.trust import checklist, covariance, say
+from foamfit.trust.best_point import BestPoint, cycle_growth, visited
 from foamfit.trust.budget import Settled, changed, judged, make_budget, of_flight, settle
-from foamfit.trust.checklist import (
-    POOR,
-    lost_height,
-    make_checklist,
-    may_vanish,
-    status_of,
-    warnings_of,
-)
 from foamfit.trust.covariance import Ends
 from foamfit.trust.identifiability import Insight, look
-from foamfit.trust.residuals.law_error import CurveError
 
-# A profile narrower than the local interval by more than this factor has stalled.
-STALLED = 2.0
+STALLED = 2.0  # a profile narrower than the local interval by more than this factor has stalled
 SHORT = 0.8  # share of the change by friction that a linear step finds, in synthetic records
 UNDER = 0.05  # share of the peak stress, above which a record ends under load
 CLOSED = 0.005  # area of a loop over peak stress times largest strain, below which it is closed
@@ -63,15 +52,15 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
     settled = settle(best, best.contradictions or of_flight(best))
     doubts = _doubts(best, record, intervals)
     estimates, budget = make_budget(best, _estimates(best, insight, intervals, settled, doubts))
-    checklist = make_checklist(best, estimates, misfit, record, balance, intervals)
+    checks = checklist.make_checklist(best, estimates, misfit, record, balance, intervals)
     springs = best.values[: len(problem.model.names)]
     return Fit(
         measurement=measurement,
         model=problem.model.name,
         drive=objective.drive,
         seed=record.seed,
-        status=status_of(checklist),
-        warnings=warnings_of(checklist),
+        status=checklist.status_of(checks),
+        warnings=checklist.warnings_of(checks),
         chain=problem.model.chain(springs, specimen.height, specimen.area),
         params=problem.told(),
         parameters=estimates,
@@ -97,39 +86,34 @@ def conclude(best: BestPoint, record: SearchRecord, intervals: Intervals | None 
         switches=_switches(best),
         correlation=correlation,
         notes=(*problem.notes, *_notes(best), *intervals.notes),
-        checklist=checklist,
+        checklist=checks,
         insight=insight,
         stopped=record.stopped,
         relaxation=problem.model.relaxation,
         interior_mass=objective.interior_mass,
-        noise=noise_of(best, best.errors if best.names else ()),
+        noise=_noise(best),
         intervals=replace(intervals, draws={}),
         budget=budget,
         priors={prior.name: (prior.mean, prior.sigma) for prior in objective.given},
         weighed_at=() if objective.weighing is None else tuple(objective.weighing.at.tolist()),
         problem=problem,
-        effort=Effort(
-            objective.evaluations,
-            objective.spent.sloped,
-            objective.spent.seconds,
-            SPENT.seconds - record.compiled,
-            total,
-        ),
+        effort={
+            "simulations": objective.spent.evaluations,
+            "with_derivatives": objective.spent.sloped,
+            "simulating": objective.spent.seconds,
+            "compiled": SPENT.seconds - record.compiled,
+            "total": total,
+        },
         draws={n: draw + measurement.origins.get(n, 0.0) for n, draw in intervals.draws.items()},
     )
 
 
-def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[str, Any]]:
-    """Return the noise of each fitted curve, its source, and residuals and model error, SI.
-
-    `errors` has one entry per fitted curve, or is empty if nothing varies. `law_error` is the RMS
-    model error, or None without it; `law_error_evidence` is the reduction of the Bayesian
-    information criterion by including it. `residual_q95` is the 95th percentile of the absolute
-    residuals.
-    """
+def _noise(best: BestPoint) -> dict[str, dict[str, Any]]:
+    """Return the noise of each fitted curve, its source, and residuals and RMS model error, SI."""
     objective, out = best.problem.objective, {}
-    pairs = zip(objective.rms(best.residual).items(), errors or repeat(None), strict=False)
-    for (name, rms), error in pairs:
+    smoothed = objective.drive == "displacement" and objective.scenes.motion is not None
+    errors = best.errors if best.names else repeat(None)
+    for (name, rms), error in zip(objective.rms(best.residual).items(), errors, strict=False):
         curve = objective.as_read(name, best.simulated.curves[name])
         residual = curve - objective.measured[name]
         level = objective.noise(name)
@@ -139,7 +123,7 @@ def noise_of(best: BestPoint, errors: Sequence[CurveError]) -> dict[str, dict[st
             "law_error": error.law / objective.factor(name) if error and error.found else None,
             "law_error_evidence": error.evidence if error else None,
             "residual_over_noise": rms / level.sigma if level.sigma > 0.0 else None,
-            "motion_smoothed": objective.drive == "displacement" and objective.motion is not None,
+            "motion_smoothed": smoothed,
             "residual_q95": float(np.quantile(np.abs(residual[objective.kept[name]]), 0.95)),
         }
     return out
@@ -168,10 +152,7 @@ def _notes(best: BestPoint) -> tuple[str, ...]:
 
 
 def _masses(best: BestPoint) -> dict[str, Any] | None:
-    """Return the effect of interior masses omitted from an impact; None if none were omitted.
-
-    "ended" is the error if the simulation with the masses fails.
-    """
+    """Return the effect of interior masses omitted from an impact, or the error that "ended" it."""
     objective, mass = best.problem.objective, best.problem.measurement.specimen.mass
     if objective.drive != "impact" or objective.interior_mass:
         return None
@@ -225,11 +206,11 @@ def _doubts(best: BestPoint, record: SearchRecord, intervals: Intervals) -> dict
         "begun": (model.relaxation or objective.drive == "impact")
         and any(UNDER_LOAD in note for note in test.notes),
         "ended": ended if errs and objective.drive != "impact" and ended > UNDER else 0.0,
-        "lost": lost_height(best),
+        "lost": checklist.lost_height(best),
         "stayed": test.last_cycle is None and test.start_strain != 0.0 and _is_closed(best),
         "alone": errs and not (record.stopped or record.led) and 0 < record.agreeing < 2,
         "cornered": next((name for name in several if errs and any(best.at_limits(name))), ""),
-        "off": misfit if misfit > POOR else 0.0,
+        "off": misfit if misfit > checklist.POOR else 0.0,
         "curve": curve,
     }
 
@@ -248,10 +229,7 @@ def _is_closed(best: BestPoint) -> bool:
 
 
 def _is_led(test: Measurement) -> bool:
-    """Return whether the machine led the motion: loading is straighter in motion than in stress.
-
-    Such a stress bends where the springs switch, and smoothing rounds its bends.
-    """
+    """Return whether the machine led the motion: its stress has bends, which smoothing rounds."""
     if test.displacement is None:
         return False
     n = int(np.argmax(test.displacement)) + 1
@@ -280,10 +258,8 @@ def _estimates(
         if (estimate := varied.get(name)) is None:
             vary, spring = bool(parameter.vary), split_name(name)[0] + 1
             state, key = ("not determined", "unreached") if vary else ("fixed", "held")
-            stderr: float | None = None
-            ends: Ends | None = None
-            if parameter.expr:
-                key, (stderr, ends) = "tied", _of_tied(best, name, varied)
+            stderr, ends = _of_tied(best, name, varied) if parameter.expr else (None, None)
+            key = "tied" if parameter.expr else key
             if (shown := problem.kept.get(name)) is not None:
                 key, stderr, half = "kept", shown.sigma, 1.96 * shown.sigma
                 ends = value - half, value + half
@@ -310,19 +286,17 @@ def _correlation(best: BestPoint) -> Correlation:
 def _of_tied(
     best: BestPoint, name: str, varied: Mapping[str, ParameterEstimate]
 ) -> tuple[float | None, Ends | None]:
-    """Return standard error and 95 % interval of a parameter that an expression gives, linearised.
-
-    If it depends on a single varied parameter, its interval follows from that of the other.
-    """
+    """Return the linearised error and 95 % interval of a parameter that an expression gives."""
     if not varied:
         return None, None
     slopes = best.problem.moves(best.values, best.names)[best.problem.index[name]]
     by = np.flatnonzero(slopes)
     variance = float(slopes[by] @ best.spread.matrix[np.ix_(by, by)] @ slopes[by])
     value, half = best.value(name), 1.96 * math.sqrt(max(variance, 0.0))
-    if not 0.0 < half <= covariance.NOTHING * best.problem.sizes((name,), best.values)[0]:
+    if not 0.0 < half <= covariance.NOTHING * best.size(name):
         return None, None
     ends = value - half, value + half
+    # That of a single other parameter need not be symmetric.
     if by.size == 1 and (ci95 := (one := varied[best.names[by[0]]]).ci95) is not None:
         first, last = (value + float(slopes[by[0]]) * (end - one.value) for end in ci95)
         ends = min(first, last), max(first, last)
@@ -392,7 +366,7 @@ def _state_of(
         reason = why if math.isfinite(ends[1] - ends[0]) else say("why", "independent")
         return state, insight.combination(name, covariance.NOTHING / 1.96) or reason
     at_bound = value in limits and value != 0.0
-    if may_vanish(name) and ends[0] <= 0.0 <= ends[1] and not at_bound:
+    if checklist.may_vanish(name) and ends[0] <= 0.0 <= ends[1] and not at_bound:
         below = any_param(split_name(name)[1]).admissible == "zero or negative"
         side, end = ("lower", ends[0]) if below else ("upper", ends[1])
         what = what.removesuffix(" interval")
@@ -422,8 +396,8 @@ def _statistics(best: BestPoint, record: SearchRecord) -> dict[str, float | int 
         "aic": aic,
         "aicc": aic + 2 * n_vary * (n_vary + 1) / freedom if freedom > 0 else None,
         "bic": log_likelihood + n_vary * math.log(n),
-        "nfev": objective.evaluations,
-        "n_failed": objective.failures,
+        "nfev": objective.spent.evaluations,
+        "n_failed": objective.spent.failures,
         "n_starts": record.starts,
         "n_descents": record.descents,
         "n_agreeing": record.agreeing,

@@ -1,9 +1,9 @@
 """Uncertainty of the identified parameters: covariance, intervals and states.
 
 A 95 % interval shows where the best point of the law would lie if the tests were measured again.
-The covariance therefore includes the noise only, with its correlation (`noise_process`); model
-error (`law_error`) only changes how the best point responds to the noise. A fit of one test is a
-single block whose parameters are the unknowns.
+The covariance therefore includes the noise only, with its correlation; model error only changes how
+the best point responds to the noise (`residuals`). A fit of one test is a single block whose
+parameters are the unknowns.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from foamfit.arrays import Array
-from foamfit.fitting.box import scale_in_words
-from foamfit.text import percent
-from foamfit.trust.residuals.noise_process import NoiseProcess, noise_processes, parts
+from foamfit.springs.parameters import unit_of
+from foamfit.text import engineering, percent
+from foamfit.trust.residuals import NoiseProcess, noise_processes, parts
 
 Ends = tuple[float, float]
 # A parameter is weak if half its 95 % interval exceeds WEAK times its scale (`fitting.box.Scales`),
@@ -279,6 +279,13 @@ def wider(ends: Ends, span: Ends | None) -> tuple[Ends, str]:
     if span is not None and span[1] - span[0] > ends[1] - ends[0]:
         return span, "range"
     return ends, "95 % interval"
+
+
+def scale_in_words(name: str, value: float, scale: float) -> str:
+    """Return the scale of a parameter in words: its value, or a number with its unit."""
+    if math.isclose(scale, abs(value), rel_tol=1e-9):
+        return "its value"
+    return engineering(scale, unit_of(name))
 
 
 def state(

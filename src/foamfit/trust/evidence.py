@@ -25,20 +25,18 @@ from scipy import special
 
 from foamfit.arrays import Array
 from foamfit.fitting import levenberg
-from foamfit.fitting.branches import branch_of_samples
 from foamfit.fitting.objective import Objective
 from foamfit.fitting.search import Tracker, squares
 from foamfit.parts import law_in_words
 from foamfit.results import Fit
-from foamfit.trust.best_point import BestPoint
+from foamfit.trust.best_point import BestPoint, branch_of_samples
 from foamfit.trust.covariance import NOTHING
-from foamfit.trust.residuals.noise_process import autocorrelation_time
+from foamfit.trust.residuals import autocorrelation_time
 
 # p-value of the runs and neighbours tests below which residuals are not random. One true model in
 # ten to twenty fails by chance.
 LEVEL = 0.05
-# p-value below which the residuals certainly contain model error.
-SURE = 1e-4
+SURE = 1e-4  # p-value below which the residuals certainly contain model error
 # Reduction of both AICc and BIC for which a richer model is preferred: "strong" evidence in Kass &
 # Raftery (1995), J. Am. Stat. Assoc. 90, 773.
 MARGIN = 6.0
@@ -48,16 +46,14 @@ SHARE = 0.03
 # A model is not chosen if its misfit is more than this many times that of another model with as
 # many parameters, whatever its prediction.
 WORSE = 2.0
-# Below this misfit over range, residuals are the numerical error of the simulation.
-EXACT = 1e-5
+EXACT = 1e-5  # below this misfit over range, residuals are the numerical error of the simulation
 # Number of blocks in time. With 8, a block removes an entire feature of the loop (turning point,
 # first stress), and its prediction is a matter of chance; from about 24 on the ranking is stable.
 BLOCKS = 24
 # Largest number of Levenberg-Marquardt steps without a block, and the relative gain of the cost
 # below which two successive steps end the fit.
 STEPS, ENOUGH = 20, 1e-3
-# Structure is called bent if a parabola removes more than this share of its squares.
-BENT = 0.6
+BENT = 0.6  # structure is called bent if a parabola removes more than this share of its squares
 
 
 def runs_test(residual: Array) -> float:
@@ -299,7 +295,7 @@ class Structure:
 
 
 def find_structure(residual: Array, places: NDArray[np.str_]) -> Structure:
-    """Find the place, as of `fitting.branches.branch_of_samples`, with the largest structure."""
+    """Find the place, as of `branch_of_samples`, with the largest structure."""
     product, branches = residual[1:] * residual[:-1], places[1:]
     sums = {str(place): float(product[branches == place].sum()) for place in np.unique(places)}
     place = max(sums, key=lambda key: sums[key])

@@ -10,20 +10,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from foamfit.arrays import Array
-from foamfit.fitting.box import scale_in_words
-from foamfit.fitting.branches import sections
 from foamfit.fitting.nuisance import POSITIVE
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import listed
 from foamfit.trust import say
-
-if TYPE_CHECKING:
-    from foamfit.trust.best_point import BestPoint
+from foamfit.trust.best_point import BestPoint, sections
+from foamfit.trust.covariance import scale_in_words
 
 PART = 0.05  # smallest component of a direction that counts
 NAMED = 0.3  # smallest component, relative to the largest, that is named in a sentence
@@ -47,15 +43,12 @@ class Insight:
 
     @cached_property
     def _directions(self) -> tuple[Array, Array]:
-        """Standard errors along the principal directions (k,), and the directions as rows (k, k).
-
-        The last direction is the weakest; its error is infinite if the curves do not depend on it.
-        """
+        """Standard errors along the principal directions (k,), and these as rows, weakest last."""
         k = len(self.names)
         triangle = np.linalg.qr(self.triangles.reshape(-1, k), mode="r")
         _, singular, vt = np.linalg.svd(triangle, full_matrices=True)
         tiny = 1e-12 * max(float(singular.max(initial=0.0)), 1e-300)
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore"):  # infinite where the curves do not depend on a direction
             return np.where(singular > tiny, 1.0 / singular, np.inf), vt
 
     def shares(self) -> Array:
@@ -124,10 +117,9 @@ class Insight:
         change = change / change[me]
         change[me] = 0.0
         order = np.argsort(-np.abs(change), kind="stable")
-        parts = [i for i in order if abs(change[i]) > NAMED * abs(change[order[0]])]
-        return say(
-            "why", "compensated", most=MOST, parts=[(self.names[i], change[i]) for i in parts]
-        )
+        large = [i for i in order if abs(change[i]) > NAMED * abs(change[order[0]])]
+        parts = [(self.names[i], change[i]) for i in large]
+        return say("why", "compensated", most=MOST, parts=parts)
 
 
 def look(best: BestPoint) -> Insight:

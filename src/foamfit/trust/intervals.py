@@ -24,7 +24,7 @@ from foamfit.springs.parameters import NUISANCE
 from foamfit.trust import say
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import WEAK, Uncertainty
-from foamfit.trust.profile import BETTER, PLACED, Refit, departures, trace
+from foamfit.trust.refits import BETTER, PLACED, Refit, departures, trace
 
 # "auto" profiles a parameter if the root of the cost departs from a straight line by this share at
 # an end of its local interval.
@@ -38,8 +38,7 @@ ENOUGH_DRAWS = 40
 HARDLY_WORSE = 2.0
 # A value is far outside its interval beyond this multiple of the width: one, less rounding.
 FAR = 1.0 - 1e-9
-# Iterations of a refit at a value one width outside an interval.
-ITERATIONS = 10
+ITERATIONS = 10  # iterations of a refit at a value one width outside an interval
 # Largest start distance of a walker from the best point along an undetermined direction, over the
 # scales of the parameters.
 FARTHEST = 0.1
@@ -120,10 +119,7 @@ def evaluations_of(best: BestPoint, choice: Choice) -> float:
 
 
 def _with_minima(best: BestPoint, made: Intervals, minima: Minima) -> Intervals:
-    """Extend the intervals to other minima that different noise could have made the best.
-
-    Values far outside their intervals, at minima hardly worse than the best, go to `elsewhere`.
-    """
+    """Extend the intervals to minima that other noise could make the best; note values far off."""
     ends, methods = dict(made.ends), dict(made.methods)
     intervals = {name: made.ends.get(name, best.local(name)) for name in best.known}
     for point, _, halves in minima:
@@ -211,10 +207,10 @@ def _by_profiles(
     best: BestPoint, names: Sequence[str], tracker: Tracker, budget: float
 ) -> Intervals:
     """Profile some parameters, until a better point is found or time is up."""
-    allowed = tracker.objective.evaluations + budget
+    allowed = tracker.objective.spent.evaluations + budget
     profiles, better = list[Profile](), None
     for name in names:
-        if tracker.objective.evaluations >= allowed:
+        if tracker.objective.spent.evaluations >= allowed:
             break
         profile, better = trace(best, name, tracker)
         profiles.append(profile)
