@@ -14,16 +14,17 @@ import numpy as np
 from numba import njit
 
 import foamfit as ff
-from foamfit.springs import law as formulas, laws
+from foamfit.springs import laws
+from foamfit.springs.laws import bistable
 
 PAPER = laws.law("bistable")
-points_of = njit(formulas.derived_points)
+points_of = njit(bistable.derived_points)
 A, D, C, E = range(4)  # branches
 
 
 def admissible(p):
     """Return whether the parameters are admissible."""
-    return formulas.admissible(*p[:7]) and p[7] >= 0.0 and p[8] > 0.0
+    return bistable.admissible(*p[:7]) and p[7] >= 0.0 and p[8] > 0.0
 
 
 def stress(p, x, strain, branch):

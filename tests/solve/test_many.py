@@ -10,7 +10,7 @@ from test_simulation import AREA, MODEL_1
 
 import foamfit as ff
 from foamfit.solve import plan as planned
-from foamfit.solve.compiled import static
+from foamfit.solve.compiled import groups
 from foamfit.solve.plan import AGGREGATE, EXPLICIT_STEPS
 from foamfit.solve.simulation import Response
 from foamfit.springs.laws.bistable import LAW
@@ -146,14 +146,14 @@ def test_springs_under_a_known_elongation_carry_one_stress(
     monkeypatch: pytest.MonkeyPatch, count: int, linear: bool
 ) -> None:
     """The strains add up to the elongation and satisfy the spring laws on every branch."""
-    chain, found, balance = chain_of(count, linear=linear), [], static.balance
+    chain, found, balance = chain_of(count, linear=linear), [], groups.balance
 
     def kept(*given: np.ndarray) -> float:
         miss = balance(*given)
         found.extend(given[-1])
         return miss
 
-    monkeypatch.setattr(static, "balance", kept)
+    monkeypatch.setattr(groups, "balance", kept)
     drive, time = ff.DisplacementDrive(TO_AND_FRO), np.arange(float(TO_AND_FRO.size))
     stress = ff.simulate(chain, drive, time).base_stress
     (strain, branches), heights = found, chain.arrays.heights

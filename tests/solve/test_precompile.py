@@ -20,7 +20,7 @@ from conftest import RECONSTRUCTION, run, without_pictures
 from foamfit import api
 from foamfit.solve import cache, precompile
 from foamfit.solve.compiled import loop
-from foamfit.springs.compiled import bistable, stale
+from foamfit.springs.compiled import bistable, contract
 
 # Reads a test, compiles for a model, fits, and prints what the fit compiled
 # or read from the cache besides.
@@ -141,7 +141,7 @@ def test_what_is_compiled_where_it_is_needed_is_announced_once(
     caplog.set_level(logging.WARNING, logger="foamfit")  # an earlier --quiet may have raised it
     new, known, kept, other = Loop(), Loop(), Loop(), Loop()
     known.signatures = ((),)
-    cache._first.cache_clear()
+    monkeypatch.setattr(cache, "_ONCE", iter([", once after installation"]))
     for one in (new, new, known, other):
         cache.announce(one, "the solver of slow scenes")
     (tmp_path / "implicit.integrate_slowly-30.py311.1.nbc").touch()
@@ -155,11 +155,11 @@ def test_what_is_compiled_where_it_is_needed_is_announced_once(
 def test_every_module_with_compiled_loops_is_known() -> None:
     """Modules outside `FOLDERS` do not compile; the folders of all caches are watched."""
     written = {
-        path.relative_to(stale.PACKAGE)
-        for path in stale.PACKAGE.rglob("*.py")
+        path.relative_to(contract.PACKAGE)
+        for path in contract.PACKAGE.rglob("*.py")
         if re.search(r"\b(njit|cfunc)\b|^@(inner|inlined|outer|pointed)\b", path.read_text(), re.M)
     }
-    assert set(stale.FOLDERS) == {path.parts[0] for path in written}
-    stored = {stale.PACKAGE / path.parent / "__pycache__" for path in written}
+    assert set(contract.FOLDERS) == {path.parts[0] for path in written}
+    stored = {contract.PACKAGE / path.parent / "__pycache__" for path in written}
     if not os.environ.get("NUMBA_CACHE_DIR"):
         assert cache._caches() == stored

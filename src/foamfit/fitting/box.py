@@ -24,8 +24,7 @@ from foamfit.arrays import Array
 from foamfit.data.cycles import cycles_of, find_turns
 from foamfit.data.measurement import Measurement
 from foamfit.fitting import nuisance
-from foamfit.springs.laws.record import Between, Law, Param
-from foamfit.springs.loop import Loop
+from foamfit.springs.laws.record import Between, Law, Loop, Param
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE, any_param, family, split_name
 

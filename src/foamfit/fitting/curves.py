@@ -19,7 +19,7 @@ from foamfit.data.motion import SmoothMotion, follow
 from foamfit.data.noise import EXACT, TENSION, lowest_mean, residual_noise
 from foamfit.errors import InputError
 from foamfit.options import DRIVES
-from foamfit.solve.scene import Motion
+from foamfit.solve.plan import Motion
 from foamfit.springs.model import Model
 
 # Curves of every test; tests with measured interior masses add displacement_1_time, ….

@@ -24,7 +24,7 @@ from foamfit.errors import InputError, SimulationError, raise_signal
 from foamfit.fitting import curves, nuisance as nuisances
 from foamfit.fitting.box import thinned
 from foamfit.fitting.scenes import NOWHERE, Places, Scenes, channel_of
-from foamfit.solve.scene import Motion
+from foamfit.solve.plan import Motion
 from foamfit.springs.model import Model
 
 PENALTY = 10.0  # residual after a failed simulation, as a multiple of the measured range

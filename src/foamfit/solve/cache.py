@@ -10,7 +10,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from foamfit.springs.compiled.stale import drop_stale
+from foamfit.springs.compiled.contract import drop_stale, nothing
 
 LOG = logging.getLogger(__name__)
 
@@ -18,9 +18,8 @@ LOG = logging.getLogger(__name__)
 def _caches() -> set[Path]:
     """Return numba's cache folders of this package, one for each folder with compiled loops."""
     from foamfit.solve.compiled import loop
-    from foamfit.springs.compiled import bistable
 
-    loops: tuple[Any, ...] = (loop.integrate, bistable.fill)
+    loops: tuple[Any, ...] = (loop.integrate, nothing)
     return {Path(loop.stats.cache_path or ".") for loop in loops}
 
 
@@ -37,22 +36,16 @@ def warn(what: str) -> None:
     LOG.warning("foamfit: %s", compiling(what))
 
 
-@functools.cache
-def _first() -> str:
-    return ", once after installation"
+_ONCE = iter([", once after installation"])  # of the first message only
 
 
 def compiling(what: str) -> str:
     """Return the message that `what` is compiled; the first says that this happens only once."""
-    once = "" if _first.cache_info().currsize else _first()
-    return f"compiling {what}{once}"
+    return f"compiling {what}{next(_ONCE, '')}"
 
 
 def compiled(name: str = "integrate") -> bool:
-    """Whether the cache contains a loop compiled from the current source.
-
-    Files of another source are removed before; see `springs.compiled.stale`.
-    """
+    """Whether the cache contains a loop compiled from the current source, after `drop_stale`."""
     for folder in (caches := _caches()):
         drop_stale(folder)
     return any(True for folder in caches for _ in folder.glob(f"*.{name}-*.nbc"))

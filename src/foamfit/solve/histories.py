@@ -10,23 +10,20 @@ from numpy.typing import NDArray
 
 from foamfit.arrays import Array
 from foamfit.solve import cache
-from foamfit.solve.compiled import along, loop, static
-from foamfit.solve.compiled.run import ENDED, OUTCOME, SWITCHES
+from foamfit.solve.compiled import along, groups, loop
+from foamfit.solve.compiled.run import DONE, ENDED, MOTION, OUTCOME, STRESS, SWITCHES
 from foamfit.solve.layout import Shape, memory_of
-from foamfit.solve.scene import DONE, MOTION, NO_SWITCHES, STRESS
 from foamfit.springs.compiled import compiled
 from foamfit.springs.compiled.contract import FLOWS, INTERNAL
 from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, Law
 
+NO_SWITCHES = np.empty((0, 5))
 _ONE = np.ones(1)
 TOL = 1e-12  # of a law with internal variables
 
 
-def _given(law: Law, row: Array, history: Array, top: int, out: Array) -> tuple[list[Any], bool]:
-    """Return the arguments that all runs have in common, and whether they integrate in time.
-
-    Time is the number of the sample; it stands still for the law.
-    """
+def _given(law: Law, row: Array, history: Array, top: int) -> tuple[list[Any], bool]:
+    """Return the arguments that all runs have in common, and whether they integrate in time."""
     row, made = row.copy(), compiled(law)
     integrated = made.kind == INTERNAL and (made.flows == FLOWS or top == STRESS)
     row[0] = 0.0  # no dashpot
@@ -36,50 +33,47 @@ def _given(law: Law, row: Array, history: Array, top: int, out: Array) -> tuple[
     if top == STRESS:
         scales = 1e-3, 0.0, 1e-3, most
     reals = np.array((0.0, 0.0, 0.0 if integrated else TOL, TOL, 1e9, 0.0, 0.0, *scales))
+    # The number of the sample; time stands still for the law.
     time = np.arange(history.size, dtype=float)
+    out = np.empty((1, 2, history.size))
     return [*memory, row[None, :], _ONE, _ONE, reals, history, time, out], integrated
 
 
 def stress_along(law: Law, row: Array, strain: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return stresses (Pa) and numbers of branches along a strain history from rest, (n,).
-
-    `row` is that of a spring of the law, without relaxation.
-    """
-    out, samples = np.empty((1, 2, strain.size)), np.zeros((strain.size, 4))
-    given, integrated = _given(law, row, strain, MOTION, out)
+    """Return stresses (Pa) and branches along a strain history from rest, (n,); no relaxation."""
+    given, integrated = _given(law, row, strain, MOTION)
+    told, time, stress = given[1], given[-2], given[-1][0, 0]
     cache.announce(along.follow, "the laws of springs")
     if not integrated:
+        samples = np.empty((strain.size, 4))
         along.follow(*given, NO_SWITCHES, samples)
-        return out[0, 0], samples[:, 2].astype(np.int64)
-    branches = np.zeros(strain.size, np.int64)
-    log, told = np.empty((4 * strain.size + 64, 5)), given[1]
+        return stress, samples[:, 2].astype(np.int64)
+    branches, log = np.zeros(strain.size, np.int64), np.empty((4 * strain.size + 64, 5))
     loop.integrate(*given, log)
     for at, _, _, entered, _ in log[: int(told[SWITCHES])].tolist():
-        branches[int(np.searchsorted(given[7], at, "right")) :] = int(entered)
+        branches[int(np.searchsorted(time, at, "right")) :] = int(entered)
     if told[OUTCOME] != DONE:
-        out[0, 0, int(np.searchsorted(given[7], told[ENDED])) :] = np.inf
-    return out[0, 0], branches
+        stress[int(np.searchsorted(time, told[ENDED])) :] = np.inf
+    return stress, branches
 
 
 def strain_along(law: Law, row: Array, stress: Array) -> Array:
     """Return strains along a stress history (Pa) from rest, (n,); not finite without a strain."""
-    out = np.empty((1, 2, stress.size))
-    given, integrated = _given(law, row, stress, STRESS, out)
+    given, integrated = _given(law, row, stress, STRESS)
     if not integrated:
         history = np.empty((2, 1, stress.size))
-        static.balance(*given, NO_SWITCHES, history)
+        groups.balance(*given, NO_SWITCHES, history)
         return np.asarray(history[0, 0])
     loop.integrate(*given, NO_SWITCHES)
-    if given[1][OUTCOME] != DONE:
-        out[0, 1, :] = np.nan
-    return np.asarray(out[0, 1])
+    strain = given[-1][0, 1]
+    return np.asarray(strain if given[1][OUTCOME] == DONE else np.full_like(strain, np.nan))
 
 
 def slope_along(law: Law, row: Array, strain: Array) -> Array:
     """Return slopes dσ/dε (Pa) along a strain history, (n,), each on the branch of its sample."""
-    given, integrated = _given(law, row, strain, MOTION, np.empty((1, 2, strain.size)))
+    given, integrated = _given(law, row, strain, MOTION)
     if not integrated:
-        samples = np.zeros((strain.size, 4))
+        samples = np.empty((strain.size, 4))
         along.follow(*given, NO_SWITCHES, samples)
         return samples[:, 3]
     # Differences over the last thousandth of the way to each sample; a sample without a way has the
@@ -97,29 +91,11 @@ def slope_along(law: Law, row: Array, strain: Array) -> Array:
 # ---------------------------------------------------------------- scenes in closed form
 
 
-def at_samples(strain: Array, moved: bool) -> Array:
-    """Return what `along.follow` is given and fills at each sample of a motion, (n, 4).
-
-    The first two columns are the derivative by a shift of the motion in contact, if it is asked for
-    (`moved`): their product with (1, ε).
-    """
-    out = np.zeros((strain.size, 4))
-    if moved:
-        contact = (strain != 0.0).astype(float)
-        out[:, 0] = contact
-        for j in np.flatnonzero(np.diff(contact)) + 1:  # contact begins or ends before this sample
-            out[j, :2] = 0.0, 1.0 / (strain[j] - strain[j - 1]) * (contact[j] - contact[j - 1])
-    return out
-
-
 def add_dashpot(
     out: Array, time: Array, strain: Array, eta: float, height: float, own: list[int],
     samples: Array,
 ) -> None:  # fmt: skip
-    """Add the stress of the dashpot of one spring along its motion, and its derivatives.
-
-    `own` are the second numbers of their directions; for `samples` see `at_samples`.
-    """
+    """Add the stress of the dashpot of one spring, and its derivatives in directions `own`."""
     if time.size == 1 or not (eta > 0.0 or OWN_ETA in own):
         return
     rate = np.gradient(strain, time)

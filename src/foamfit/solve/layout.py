@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from foamfit.arrays import Array
 from foamfit.solve import cache
 from foamfit.solve.compiled import run
-from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
+from foamfit.solve.compiled.run import FREE, MOTION, STRESS, VISCOUS
 from foamfit.springs.compiled import compiled, contract
 from foamfit.springs.compiled.contract import BY_STRESS, FADES, INTERNAL
 from foamfit.springs.laws.record import DRAG, OWN_ETA, OWN_HEIGHT, Law
@@ -80,10 +80,7 @@ def place_state(
 
 
 def order(groups_of: NDArray[np.int64], groups: int) -> tuple[NDArray[np.int64], int]:
-    """Order components by groups: return the place of each, and the reach.
-
-    Components couple with those of the neighbouring groups: at places closer than the reach.
-    """
+    """Return the place of each component, ordered by groups; closer than the reach they couple."""
     places = np.argsort(np.argsort(groups_of, kind="stable"))
     sizes = [0, *np.bincount(groups_of, minlength=groups)]
     return places, int(max(a + b for a, b in pairwise(sizes))) - 1
@@ -92,10 +89,7 @@ def order(groups_of: NDArray[np.int64], groups: int) -> tuple[NDArray[np.int64],
 def _functions(
     shape: Shape, several: bool, internal: bool, fades: bool, relaxes: bool
 ) -> tuple[int, ...]:
-    """Return the addresses of the functions that a run needs, 0 for others (see run.ADDRESSES).
-
-    A module is imported, and a function compiled, when its address is first asked for.
-    """
+    """Return the addresses of the functions that a run needs, 0 for others (see run.ADDRESSES)."""
     integrated = shape.integrated
     if integrated:
         from foamfit.solve.compiled import loop
@@ -105,10 +99,11 @@ def _functions(
         ("motion", "compute_rates", True), ("groups", "group_values", several),
         ("internal", "inside_task", internal), ("events", "enter_branch", True),
         ("implicit" if shape.degree else "explicit", "step", integrated),
-        ("loop", "advance", integrated), ("drive", "next_piece", integrated and not shape.struck),
-        ("samples", "sample_task", integrated), ("decay", "fade", fades),
-        ("series", "relaxing_step", relaxes),
+        ("loop", "advance", integrated), ("loop", "next_piece", integrated and not shape.struck),
+        ("samples", "sample_task", integrated), ("internal", "fade", fades),
+        ("explicit", "relaxing_step", relaxes),
     )  # fmt: skip
+    # A module is imported, and a function compiled, when its address is first asked for.
     return tuple(
         getattr(import_module(f"foamfit.solve.compiled.{module}"), name).address if needed else 0
         for module, name, needed in functions

@@ -11,22 +11,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from foamfit.arrays import Array
-from foamfit.errors import InputError
-from foamfit.solve import cache, histories, scene as scenes
-from foamfit.solve.compiled import along, loop, rates, static
-from foamfit.solve.compiled.run import AT, ENDED, FINITE, NOW, OUTCOME, POINTS, SWITCHES, TOLD
+from foamfit.errors import InputError, SimulationError
+from foamfit.solve import cache, histories
+from foamfit.solve.compiled import along, groups, loop, rates, run
 from foamfit.solve.compiled.samples import increases
+from foamfit.solve.histories import NO_SWITCHES
 from foamfit.solve.layout import Memory, Shape, memory_of
-from foamfit.solve.scene import CLOSED_FORM as CLOSED_FORM, NO_SWITCHES, Motion as Motion, Slopes
 from foamfit.springs.chain import Chain, DisplacementDrive, Drive, Impact, StressDrive
 from foamfit.springs.compiled import compiled, slopes_of
 from foamfit.springs.compiled.contract import FLOWS, INTERNAL, Compiled
-from foamfit.springs.laws.record import MOVED, OWN_RELAXATION, Law
+from foamfit.springs.laws.record import OWN_RELAXATION, Law
 from foamfit.springs.spring import as_samples
 
 Directions = NDArray[np.int64]
 
 FIRST_ORDER, SECOND_ORDER = "first order", "second order"
+CLOSED_FORM = "closed form"
 EXPLICIT_STEPS, RADAU, AGGREGATE = "Dormand-Prince", "Radau IIA", "aggregate"
 # Springs that an impact treats as one; error over the requested error and the springs.
 LEAST_AGGREGATE, AS_ONE = 9, 1e-4
@@ -46,13 +46,50 @@ OF_IMPLICIT, OF_IMPLICIT_MASSES = 3e-4, 2e-2  # of an implicit step
 SHORT = 5e-4
 # Least error of a step; of vibrating masses, whose steps would not exceed rounding errors below it.
 LEAST_TOL, LEAST_OF_MASSES, LEAST_VIBRATING = 2e-14, 5e-13, 5e-12  # the last of implicit steps
-# Outcomes of explicit steps after which implicit ones are tried.
-_STIFF = scenes.TOO_MANY_STEPS, scenes.STEP_UNDERFLOW
+_FAILURES = {
+    run.TOO_MANY_STEPS: "the bound of {steps} steps was reached: something in the scene is "
+    "too fast to be followed (a light mass or a heavy dashpot)",
+    run.STEP_UNDERFLOW: "the step shrank to nothing near t = {time:g} s, where the scene "
+    "changes faster than numbers can resolve (a strain at the end of its branch, a very light "
+    "mass, or many springs on a flat branch)",
+    run.TOO_FAST: "something in the scene is too fast to be followed (a light mass, or a dashpot "
+    "that is very light beside a stiff spring)",
+    run.FLAT_UNDER_STRESS: "a prescribed stress acts on a flat branch (kh_plus or kh_minus = 0) "
+    "that nothing slows; give the top a mass or the spring a dashpot",
+    run.NOT_FINITE: "a stress or strain is no longer finite: the drive goes past the end of a "
+    "branch (strain 1 on branch a, 1 + eps_star on branch c), or the stress by which a law in a "
+    "chain resists the strain rate is zero at any rate",
+}
+_PULLED = run.FLAT_UNDER_STRESS, run.NOT_FINITE  # of a unilateral spring under tension
+_STIFF = run.TOO_MANY_STEPS, run.STEP_UNDERFLOW  # after which implicit steps are tried
 LOGGED = 64
 AT_MOST = 1e-9  # error of an elongation over the height, or over the largest elongation
 
 NO_DIRECTIONS: Directions = np.empty((0, 2), np.int64)
 _NOTHING = np.zeros(1)
+
+
+class Slopes(NamedTuple):
+    """Derivatives of a motion in p directions."""
+
+    displacement: Array  #: (p, nodes, n_t)
+    base_stress: Array  #: (p, n_t)
+
+
+@dataclass(eq=False, slots=True)  # as for `Plan`
+class Motion:
+    """Result of a run before verification; for the fields see `Response`."""
+
+    displacement: Array
+    base_stress: Array
+    contact_end: float
+    switches: Array
+    steps: int
+    method: str = CLOSED_FORM
+    slopes: Slopes | None = None  #: None if no derivatives were requested
+    unresolved: float = 0.0  #: size of damped-out vibrations, relative to the ranges
+    strongest: float = 0.0  #: largest stress at an end of a step, Pa
+    tol: float = 0.0  #: allowed error of a step
 
 
 class Laws(NamedTuple):
@@ -82,10 +119,7 @@ def _numbers(
 
 @dataclass(eq=False)  # a run reads it thirty times; a named tuple takes twice as long
 class Plan:
-    """A scene prepared to run many times with different springs.
-
-    Above each group of springs lies a node with a mass, or the top.
-    """
+    """A scene for many runs with other springs; above each group lies a mass, or the top."""
 
     solver: str  #: the simplest that suffices
     laws: Laws
@@ -159,7 +193,7 @@ class Plan:
         """Return least scales of displacement, velocity, strain and stress under a drive."""
         first, total = self._slopes(rows)[0].min(), heights.sum()
         most = float(np.abs(self.values).max())
-        if self.top == scenes.MOTION:
+        if self.top == run.MOTION:
             rate = np.abs(np.diff(self.values) / np.diff(self.time)).max(initial=0.0)
             return most, rate, most / total, 1e-3 * first * most / total
         return 1e-3 * most * total / first, 0.0, 1e-3 * most / first, most
@@ -183,30 +217,28 @@ class Plan:
         for degree in methods:
             reals = self._reals(rows, heights, rtol, drag, degree)
             _, told = self._integrate(rows, heights, damped, directions, out, log, reals, degree)
-            outcome = told.item(OUTCOME)
+            outcome = told.item(run.OUTCOME)
             if outcome not in _STIFF:
                 break
-        if outcome == scenes.STEP_UNDERFLOW:
+        if outcome == run.STEP_UNDERFLOW:
             fastest = max(self.fastest_rates(rows, heights, drag))
-            told[OUTCOME] = scenes.TOO_FAST if fastest > FASTEST else scenes.STEP_UNDERFLOW
-        if outcome == scenes.DONE and everything and told.item(SWITCHES) > logged:
-            more = int(told.item(SWITCHES))
+            told[run.OUTCOME] = run.TOO_FAST if fastest > FASTEST else run.STEP_UNDERFLOW
+        if outcome == run.DONE and everything and told.item(run.SWITCHES) > logged:
+            more = int(told.item(run.SWITCHES))
             return self._integrated(rows, heights, rtol, drag, directions, everything, more)
         method = RADAU if degree else EXPLICIT_STEPS
         return self._motion(out, method, told, log, rows, reals.item(loop.TOL))
 
     def _methods(self, rows: Array, heights: Array, drag: float, damped: bytes) -> tuple[int, ...]:
-        """Return the degrees of the methods to try: 0 for explicit steps.
-
-        Where explicit steps may take as many as all, implicit ones are not tried after them.
-        """
+        """Return the degrees of the methods to try: 0 for explicit steps."""
         if self.implicit is not None or self.time.size == 1:
-            return (POINTS,) if self.implicit and self.time.size > 1 else (0,)
+            return (run.POINTS,) if self.implicit and self.time.size > 1 else (0,)
         if drag or len(self.ends) > 1 or 1 in damped:
             vibrates, relaxes = self.fastest_rates(rows, heights, drag)
             if vibrates > MOST_VIBRATION or relaxes > MOST_RELAXATION:
-                return POINTS, 0
-        return (0, POINTS) if self.max_explicit < self.max_steps else (0,)
+                return run.POINTS, 0
+        # Where explicit steps may take as many as all, implicit ones are not tried after them.
+        return (0, run.POINTS) if self.max_explicit < self.max_steps else (0,)
 
     def _reals(
         self, rows: Array, heights: Array, rtol: float, drag: float, degree: int = 0
@@ -237,10 +269,7 @@ class Plan:
         self, rows: Array, heights: Array, damped: bytes, directions: Directions, out: Array,
         log: Array, reals: Array, degree: int = 0,
     ) -> Memory:  # fmt: skip
-        """Run the loop over time, with implicit steps if `degree` is that of their polynomial.
-
-        Return the memory as the run has left it.
-        """
+        """Run the loop over time, with implicit steps if `degree` is not 0; return the memory."""
         memory = self._memory(rows, damped, directions, degree)
         drive = self.mass, reals, self.values, self.time
         cache.timed(loop.integrate, *memory, rows, heights, *drive, out, log)
@@ -266,21 +295,20 @@ class Plan:
         whole = out if out.shape[1] == 2 else np.empty((1, 2, self.time.size))
         words, told = one._integrate(row, height, b"\0", NO_DIRECTIONS, whole, log, reals)
         out[0, 0], out[0, -1] = whole[0, 0], whole[0, 1]
-        if told[OUTCOME] == scenes.DONE:
-            memory, end = told[len(NOW) + words[AT["row"]] :], told.item(ENDED)
+        if told[run.OUTCOME] == run.DONE:
+            memory, end = told[len(run.NOW) + words[run.AT["row"]] :], told.item(run.ENDED)
             log = aggregate.nodes_and_switches(memory, heights, log[:, 0], self.time, end, out)
-            told[SWITCHES], told[FINITE] = len(log), np.isfinite(out[0]).all()
+            told[run.SWITCHES], told[run.FINITE] = len(log), np.isfinite(out[0]).all()
         return self._motion(out, AGGREGATE, told, log, rows, reals.item(loop.TOL))
 
     def _motion(
         self, out: Array, method: str, told: Array, log: Array, rows: Array, tol: float
     ) -> Motion:
         """Return the result of a run as a Motion; raise SimulationError if it failed."""
-        outcome, time, steps, switches, finite, strongest, *damped = told[:TOLD].tolist()
-        if outcome != scenes.DONE or not finite:
-            outcome = int(outcome) if outcome != scenes.DONE else scenes.NOT_FINITE
-            loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
-            raise scenes.failure(outcome, self.top, self.values, loose, steps=int(steps), time=time)
+        outcome, time, steps, switches, finite, strongest, *damped = told[: run.TOLD].tolist()
+        if outcome != run.DONE or not finite:
+            outcome = int(outcome) if outcome != run.DONE else run.NOT_FINITE
+            raise self._failure(outcome, rows, steps=int(steps), time=time)
         slopes = Slopes(out[1:, 1:], out[1:, 0]) if len(out) > 1 else None
         log, lost = log[: int(switches)], loop.lost(strongest, *damped) if method == RADAU else 0.0
         first = out[0]
@@ -288,17 +316,27 @@ class Plan:
             first[1:], first[0], time, log, int(steps), method, slopes, lost, strongest, tol
         )  # fmt: skip
 
+    def _failure(self, outcome: int, rows: Array, **ending: float) -> SimulationError:
+        """Return the error of a run that failed; `ending` has its number of steps and last time."""
+        pulled = self.top == run.STRESS and outcome in _PULLED and self.values.min() < 0.0
+        loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
+        if not (pulled and loose):
+            return SimulationError(_FAILURES[outcome].format(**ending))
+        at = int(np.argmax(self.values < 0.0))
+        return SimulationError(
+            f"the prescribed stress {self.values[at]:g} Pa (sample {at}) is a tension, which "
+            f"spring {loose[0]} cannot carry because it is unilateral; give the spring a dashpot "
+            "or the top a mass, or keep the stress at zero or above"
+        )
+
     # ------------------------------------------------------------------ without integration
 
     def _closed_form(
         self, rows: Array, heights: Array, rtol: float, everything: bool, directions: Directions
     ) -> Motion | None:
-        """Solve springs in static equilibrium under one stress, or one spring in known motion.
-
-        Return None if internal variables do not decay as `compiled.decay` requires.
-        """
+        """Solve equilibrium under one stress, or one spring in known motion; None if unfit."""
         count, n = len(heights), self.time.size
-        alone = self.top == scenes.MOTION and count == 1
+        alone = self.top == run.MOTION and count == 1
         shown = count if everything else 1
         out = np.empty((1 + len(directions), 1 + shown, n))
         reals = np.array((0.0, 1.0, 0.0, rtol))
@@ -307,12 +345,12 @@ class Plan:
         given = *memory, rows, heights
         if alone:
             own, strain = directions[:, 1].tolist(), self.values / heights
-            samples = histories.at_samples(strain, MOVED in own)
+            samples = np.empty((n, 4))
             drive = self.mass, reals, strain, self.time
             outcome = cache.timed(along.follow, *given, *drive, out, NO_SWITCHES, samples)
             if outcome == along.UNFIT:
                 return None
-            fine, strains, branches = outcome == scenes.DONE, strain[None], samples[None, :, 2]
+            fine, strains, branches = outcome == run.DONE, strain[None], samples[None, :, 2]
             out[0, 1], out[1:, 1] = self.values, 0.0
             eta = rows.item(0, 0)
             histories.add_dashpot(out, self.time, strain, eta, heights.item(0), own, samples)
@@ -320,11 +358,10 @@ class Plan:
         else:
             strains, branches = history = np.empty((2, count, n))
             drive = self.mass, reals, self.values, self.time
-            miss = cache.timed(static.balance, *given, *drive, out, NO_SWITCHES, history)
+            miss = cache.timed(groups.balance, *given, *drive, out, NO_SWITCHES, history)
             fine = miss <= AT_MOST * self.height or miss <= AT_MOST * np.abs(self.values).max()
         if not fine:
-            loose = [i for i in self.laws.loose if rows[i - 1, 0] == 0.0]
-            raise scenes.failure(scenes.NOT_FINITE, self.top, self.values, loose)
+            raise self._failure(run.NOT_FINITE, rows)
         slopes = Slopes(out[1:, 1:], out[1:, 0]) if len(out) > 1 else None
         switches = histories.switches(self.time, strains, branches) if everything else NO_SWITCHES
         return Motion(out[0, 1:], out[0, 0], math.nan, switches, 0, CLOSED_FORM, slopes)
@@ -360,7 +397,7 @@ def _time(t: ArrayLike) -> Array:
 
 def _check_viscous(laws: Laws, ends: tuple[int, ...], top: int) -> None:
     """Raise InputError for a viscous law in a group of springs, whose stress would be unknown."""
-    nodes = {0, *(ends[:-1] if top in (scenes.STRESS, scenes.VISCOUS) else ends)}
+    nodes = {0, *(ends[:-1] if top in (run.STRESS, run.VISCOUS) else ends)}
     for i, (law, made) in enumerate(zip(laws.records, laws.made, strict=True)):
         if made.viscous and not {i, i + 1} <= nodes:
             raise InputError(
@@ -387,7 +424,7 @@ def plan(
     if times do not increase or do not match the drive.
     """
     time = _time(t)
-    speed, values, top, above = 0.0, _NOTHING, scenes.FREE, chain.masses[-1]
+    speed, values, top, above = 0.0, _NOTHING, run.FREE, chain.masses[-1]
     if isinstance(drive, Impact):
         speed = drive.velocity
         above += drive.mass
@@ -401,16 +438,16 @@ def plan(
                 f"{name} has {values.size} samples and t has {time.size}: give one value per sample"
             )
         if isinstance(drive, DisplacementDrive):
-            above, top = 0.0, scenes.MOTION
+            above, top = 0.0, run.MOTION
         elif above == 0.0:
-            top = scenes.VISCOUS if chain.site_damping > 0.0 else scenes.STRESS
+            top = run.VISCOUS if chain.site_damping > 0.0 else run.STRESS
     arrays, count, laws = chain.arrays, len(chain.springs), _laws(chain.laws)
     masses, heavy = np.array([*arrays.inside, above / chain.area]), len(arrays.ends) > 1
-    alone = top == scenes.MOTION and count == 1
+    alone = top == run.MOTION and count == 1
     if laws.flowing:
         _check_viscous(laws, arrays.ends, top)
     internal = laws.flowing and not (alone and laws.made[0].flows < FLOWS)
-    damped = dashpots or arrays.damped or top == scenes.VISCOUS or internal
+    damped = dashpots or arrays.damped or top == run.VISCOUS or internal
     if heavy or above > 0.0:
         solver = SECOND_ORDER
     elif ((damped or relaxing or chain.relaxes) and not alone) or internal:

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from foamfit.arrays import Array
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve import plan as plans
-from foamfit.solve.plan import NO_DIRECTIONS, Directions, Motion, Plan, plan
-from foamfit.solve.scene import MOTION, Slopes, difference
+from foamfit.solve.compiled.run import MOTION
+from foamfit.solve.plan import NO_DIRECTIONS, Directions, Motion, Plan, Slopes, plan
 from foamfit.springs.chain import Chain, ChainArrays, Drive, check_scene
 from foamfit.springs.compiled.contract import BY_STRESS
 from foamfit.springs.laws.record import DRAG, OWN_HEIGHT, OWN_RELAXATION
@@ -73,34 +73,30 @@ class Response:
         return top / self.height
 
 
-def _verified(
-    scene: Plan, arrays: ChainArrays, rtol: float, directions: Directions = NO_DIRECTIONS
-) -> Motion:
-    """Run a scene and, where its errors may grow, compare it with another run.
-
-    Raise SimulationError if the error exceeds `rtol`.
-    """
-    rows, heights = arrays.rows, arrays.heights
-    sharp = _may_snap_wrongly(scene)
-    rtol = min(rtol, ROUGH) if sharp else rtol
-    try:
-        motion = scene.run(rows, heights, rtol, directions=directions)
-    except SimulationError:
-        if not sharp or rtol < 1e-8:
-            raise
-        motion = scene.run(rows, heights, 1e-3 * rtol, directions=directions)
-    groups = len(scene.ends)
-    inside = groups > 2
-    if groups == 2:  # the base stress depends on the velocity of the mass above
-        viscous = any(one.viscous for one in scene.laws.made[: scene.ends[0]])
-        inside = viscous or bool((rows[: scene.ends[0], 0] > 0.0).any())
-    long = inside or motion.method == plans.RADAU or _is_long(scene, motion, FEW_STEPS)
-    if scene.speed > 0.0 and not long and not _hard(scene, arrays):
-        return motion
+def _verified(scene: Plan, arrays: ChainArrays, rtol: float, directions: Directions) -> Motion:
+    """Run a scene and, where errors may grow, compare it with another run, to within `rtol`."""
+    rows, heights, laws, ends = arrays.rows, arrays.heights, scene.laws.made, scene.ends
 
     def run(scene: Plan, rtol: float) -> Motion:
         return scene.run(rows, heights, rtol, directions=directions)
 
+    sharp = _may_snap_wrongly(scene)
+    rtol = min(rtol, ROUGH) if sharp else rtol
+    try:
+        motion = run(scene, rtol)
+    except SimulationError:
+        if not sharp or rtol < 1e-8:
+            raise
+        motion = run(scene, 1e-3 * rtol)
+    inside = len(ends) > 2
+    if len(ends) == 2:  # the base stress depends on the velocity of the mass above
+        viscous = any(one.viscous for one in laws[: ends[0]])
+        inside = viscous or bool((rows[: ends[0], 0] > 0.0).any())
+    long = inside or motion.method == plans.RADAU or _is_long(scene, motion, FEW_STEPS)
+    # An impact may bring a spring close to the end of its branch c if it has energy enough.
+    hard = 0.5 * scene.mass.item(-1) * scene.speed**2 >= 6.0 * arrays.steep
+    if scene.speed > 0.0 and not long and not hard:
+        return motion
     lost = motion.unresolved
     if lost > 0.7 * rtol:  # the comparison below leaves 0.3
         # An explicit step covers about 3 radians and costs 1 % of an implicit step.
@@ -131,20 +127,23 @@ def _verified(
 def _agrees_with_longer_steps(
     scene: Plan, arrays: ChainArrays, motion: Motion, rtol: float
 ) -> bool:
-    """Whether longer steps give the same motion, so that errors do not grow.
-
-    Longer steps cost less than shorter ones.
-    """
+    """Whether longer steps, which cost less than shorter ones, give the same motion."""
     part = slice(None, None, THINNED if scene.speed > 0.0 else None)
     scene = scene.changed(time=scene.time[part].copy(), least=min(LONGER * motion.tol, LONGEST))
     rough = scene.run(arrays.rows, arrays.heights, rtol)
     return _miss(motion.displacement[:, part], motion.base_stress[part], rough) <= 0.3 * rtol
 
 
+def _difference(one: Array, other: Array) -> float:
+    """Return the largest difference of two curves over the range (0 included) of the first."""
+    span = max(float(one.max()), 0.0) - min(float(one.min()), 0.0)
+    return float(np.abs(one - other).max()) / span if span > 0.0 else 0.0
+
+
 def _miss(displacement: Array, base_stress: Array, other: Motion) -> float:
     """Return the largest difference of two runs over the ranges of the first."""
     return max(
-        difference(displacement, other.displacement), difference(base_stress, other.base_stress)
+        _difference(displacement, other.displacement), _difference(base_stress, other.base_stress)
     )
 
 
@@ -190,13 +189,9 @@ def _compared(
 
 
 def _may_snap_wrongly(scene: Plan) -> bool:
-    """Whether springs share one stress that decides which of them snaps, in steps of time.
-
-    In a snap of a narrow spread the smallest error of a strain may enter the wrong branch.
-    """
-    if scene.solver != plans.FIRST_ORDER or len(scene.laws.made) == len(scene.ends):
-        return False
-    return any(one.kind == BY_STRESS for one in scene.laws.made)
+    """Whether the smallest error may decide which of the springs under one stress snaps."""
+    several = scene.solver == plans.FIRST_ORDER and len(scene.laws.made) > len(scene.ends)
+    return several and any(one.kind == BY_STRESS for one in scene.laws.made)
 
 
 def _resolve_vibrations(
@@ -225,11 +220,6 @@ def _is_long(scene: Plan, motion: Motion, few: int) -> bool:
         return motion.method != plans.AGGREGATE
     bounces = len(scene.ends) > 1 or scene.speed == 0.0
     return bounces and scene.solver == plans.SECOND_ORDER and len(motion.switches) > FEW_SWITCHES
-
-
-def _hard(scene: Plan, arrays: ChainArrays) -> bool:
-    """Whether an impact may bring a spring close to the end of its branch c."""
-    return bool(0.5 * scene.mass.item(-1) * scene.speed**2 >= 6.0 * arrays.steep)
 
 
 def _distances(scene: Plan, arrays: ChainArrays, motion: Motion) -> tuple[float, float]:
@@ -266,11 +256,9 @@ class Sensitivity:
 def _sensitivities(
     chain: Chain, names: Sequence[str], directions: Directions, slopes: Slopes
 ) -> dict[str, Sensitivity]:
-    """Return the derivatives of a run by parameter name.
-
-    The solver differentiates by η_site/H, on which η_site and every height act.
-    """
+    """Return the derivatives of a run by parameter name."""
     out = {}
+    # The solver differentiates by η_site/H, on which η_site and every height act.
     drag = chain.site_damping / chain.height
     for p, name in enumerate(names):
         motion, stress = slopes.displacement[p], slopes.base_stress[p]
@@ -335,16 +323,15 @@ def simulate(
     scene = plan(chain, drive, t, dashpots=dashpots, relaxing=relaxing)
     motion = _verified(scene, chain.arrays, rtol, directions)
     if scene.top == MOTION and len(chain.springs) > 1:
-        miss = difference(scene.values, motion.displacement[-1])
+        miss = _difference(scene.values, motion.displacement[-1])
         if not miss <= max(rtol, ROUNDING):
             raise SimulationError(
                 f"the springs' elongations miss the prescribed displacement by {miss:.1g} of its "
                 f"range, more than rtol = {rtol:g}: use a larger rtol or more samples"
             )
     end = None if math.isnan(motion.contact_end) else motion.contact_end
-    slopes: dict[str, Sensitivity] = {}
-    if motion.slopes is not None:
-        slopes = _sensitivities(chain, sensitivities, directions, motion.slopes)
+    given = motion.slopes
+    slopes = _sensitivities(chain, sensitivities, directions, given) if given else {}
     return Response(  # positional, as keywords are slower
         scene.time, motion.displacement, motion.base_stress, chain.height, end,
         scene.solver, motion.method, motion.switches, motion.steps, slopes,

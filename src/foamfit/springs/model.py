@@ -215,10 +215,7 @@ def with_options(model: str, **options: bool) -> str:
 
 
 def neighbours(model: Model, values: Array, top: float) -> Iterator[Array]:
-    """Yield parameters with nearly the same loop, from `Law.neighbours` of each spring.
-
-    `top` is the largest stress, Pa.
-    """
+    """Yield parameters with nearly the same loop up to the stress `top`, Pa (`Law.neighbours`)."""
     for spring, law in enumerate(model.laws):
         for near in law.neighbours(model.own(spring, values)[:-1], top):
             moved = values.copy()

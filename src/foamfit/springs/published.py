@@ -117,16 +117,14 @@ def table() -> str:
     for item in published.values():
         for spring, height in zip(item.chain.springs, item.chain.heights, strict=True):
             sets.append(_published_row(item, spring, height))
-        values = {point: getattr(item.bistable, point) for point in points}
-        scaled = [None if v is None else v / (MPA if "sigma" in p else 1.0)
-                  for p, v in values.items()]  # fmt: skip
-        derived.append([item.name, *("none" if v is None else f"{v:.6f}" for v in scaled)])
+        values = [(getattr(item.bistable, p), MPA if "sigma" in p else 1.0) for p in points]
+        cells = ("none" if value is None else f"{value / unit:.6f}" for value, unit in values)
+        derived.append([item.name, *cells])
         ratio = item.damping_ratio_by_formula()
         if ratio is not None and item.damping_ratio is not None:
             agrees = math.isclose(ratio, item.damping_ratio, rel_tol=2e-3)
             told = "agrees" if agrees else "does not follow from the paper's own table"
-            text = f"{item.name}: {ratio:.3g} (paper {item.damping_ratio}: {told})"
-            ratios += wrapped(text)
+            ratios += wrapped(f"{item.name}: {ratio:.3g} (paper {item.damping_ratio}: {told})")
     return "\n".join(
         [
             *wrapped("Published sets (Thevamaran, Fraternali & Daraio 2014, Tables 2 and 3)"),

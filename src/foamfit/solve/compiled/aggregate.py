@@ -82,16 +82,14 @@ def _enter(row, i, branch):
 
 @inner
 def _add(row, i, times):
-    """Add the strain of a spring to the polynomial, or subtract it (`times` -1).
-
-    On a curved branch ε = x0 + 1 - k/(k + S), a geometric series.
-    """
+    """Add the strain of a spring to the polynomial, or subtract it (`times` -1)."""
     shape, total, anchor = _shape(row, i), past(row, HEAD), row.anchor
     share, k = times * row[SPRINGS + i * OF_SPRING + 1], shape[STEEP]
     if not shape[CURVED] > 0.0:
         total[0] += share * (shape[ORIGIN] + (anchor - shape[OFFSET]) / k)
         total[1] += share * row.unit / k
         return
+    # On a curved branch ε = x0 + 1 - k/(k + S), a geometric series.
     ratio = row.unit / (k + anchor)
     total[0] += share * (shape[ORIGIN] + anchor / (k + anchor))
     term = share * k / (k + anchor) * ratio
@@ -199,10 +197,7 @@ def _switch(row, s, up, out):
 
 @contract.outer
 def _place(shapes, heights, branches, log, time, stress, free, nodes):
-    """Fill the displacements above all springs but the last, whose displacement is known.
-
-    From sample `free` on the chain flies with its top; `branches` are zeros.
-    """
+    """Fill displacements above all springs but the last, with which they fly from `free` on."""
     count, done = heights.size, 0
     for j in range(time.size):
         while done < log.shape[0] and log[done, 0] <= time[j]:
@@ -221,10 +216,8 @@ def _place(shapes, heights, branches, log, time, stress, free, nodes):
 def nodes_and_switches(
     row: Array, heights: Array, times: Array, time: Array, end: float, out: Array
 ) -> Array:
-    """Fill the displacements of all nodes, and return the switches of the springs (n, 5).
-
-    `row` is that of the run, `times` those of its changes of branch, `end` that of the contact.
-    """
+    """Fill the displacements of all nodes, and return the switches of the springs (n, 5)."""
+    # `row` is that of the run, `times` those of its changes of branch, `end` of the contact.
     count, leaves = int(row[0]), int(row[1])
     first = SPRINGS + count * OF_SPRING
     log = row[first + 4 * leaves :][: 5 * int(row[_NAMES.index("switches")])].reshape(-1, 5).copy()
@@ -238,11 +231,8 @@ def nodes_and_switches(
 
 
 def row_of(laws: tuple[contract.Compiled, ...], rows: Array, heights: Array) -> Array | None:
-    """Return the row of an aggregate; None if the springs cannot be one.
-
-    They must be undamped bistable and linear springs without flat branches and gaps; `rows` have no
-    relaxation terms.
-    """
+    """Return the row of an aggregate; None if the springs cannot be one."""
+    # Undamped bistable and linear springs, without flat branches, gaps and relaxation.
     if rows[:, 0].any() or not {bistable.COMPILED, bistable.LINEAR}.issuperset(laws):
         return None
     count = len(heights)
@@ -268,6 +258,6 @@ def law_of(count: int) -> tuple[Law, contract.Compiled]:
     """Return the law of an aggregate of so many springs."""
     columns = SPRINGS + count * OF_SPRING + 4 * _leaves(count) + 5 * MOST_SWITCHES * count
     # Explicit steps integrate its stress, so that `settle` and `strain` are not called.
-    functions = _begin, _evaluate, _switch, bistable.settle, bistable.strain
+    functions = _begin, _evaluate, _switch, contract.settle, bistable.strain
     made = contract.Compiled(None, contract.BY_STRESS, columns, 0, 1, functions)
     return Law("aggregate", (), made), made

@@ -11,17 +11,17 @@ from __future__ import annotations
 
 import math
 
+from foamfit.solve.compiled import run
 from foamfit.solve.compiled.motion import PART, evaluate
 from foamfit.solve.compiled.run import begin_run, call_fade, call_inside, change_branch
 from foamfit.solve.compiled.samples import is_finite, row_of
-from foamfit.solve.scene import DONE, NOT_FINITE
 from foamfit.springs.compiled.contract import call_number, inner, outer, past, start
 from foamfit.springs.laws.record import MOVED, OWN_ETA, OWN_HEIGHT, OWN_RELAXATION
 
 OF_STEP, TABLE = 6, 8  # columns of the table of a relaxation term, which begins with moments
 LEAST_STEP, FOLLOWED = 1e-9, 0.1  # share of an interval; error over what the middle adds
 LEAST_FADE = 1e-6  # least step with internal variables that decay
-SAME, TOO_LONG, UNFIT = range(3)  # ends of a step of `decay`; UNFIT if the law needs another solver
+SAME, TOO_LONG, UNFIT = range(3)  # ends of a step of `fade`; UNFIT if the law needs another solver
 
 
 @inner
@@ -77,10 +77,7 @@ def tabulate(x, h, table):
 
 @inner
 def quartic(first, middle, last, low, high):
-    """Return the coefficients 2 to 4 of a quartic with these values and slopes, and its `bump`.
-
-    That is what the middle adds to the cubic of the ends: bump times 16 r² (1-r)².
-    """
+    """Return coefficients 2 to 4 of a quartic; its middle adds `bump` 16 r² (1-r)² to the cubic."""
     rise, bump = last - first, middle - (0.5 * (first + last) + 0.125 * (low - high))
     square, cube = 3.0 * rise - 2.0 * low - high, low + high - 2.0 * rise
     return square + 16.0 * bump, cube - 32.0 * bump, 16.0 * bump, bump
@@ -88,20 +85,14 @@ def quartic(first, middle, last, low, high):
 
 @inner
 def integral(a, first, low, square, cube, fourth):
-    """Return ∫₀¹ exp(-x (1-r)) (first + low r + square r² + …) dr from the moments `a`.
-
-    From the next moments, a + 1, it returns the integral with another factor r: the sum of this
-    integral and its derivative by x.
-    """
+    """Return ∫₀¹ exp(-x (1-r)) (first + low r + square r² + …) dr from the moments `a`."""
+    # From the next moments, a + 1, it has another factor r: its sum with its derivative by x.
     return first * a[0] + low * a[1] + square * a[2] + cube * a[3] + fourth * a[4]
 
 
 @inner
 def relax(c, h, tables, first, low, square, cube, fourth, d_first, d_middle):
-    """Advance the relaxation terms and their derivatives over a step.
-
-    The stress is the quartic with these coefficients.
-    """
+    """Advance relaxation terms and their derivatives over a step, in which stress is a quartic."""
     s, p, y = c.springs, c.p, c.y
     for k in range(c.terms):
         tau, a, dz = s.tau[k], past(tables, k * TABLE), past(y, c.base + k * p)
@@ -139,11 +130,8 @@ def sum_up(c, j):
 
 @inner
 def step_to(c, part, h, m, seed, tol, weight):
-    """Step to a strain of the branch within h; false, unchanged, if the step is too long.
-
-    m: largest stress, share of the interval (negative if the law needs another solver), tables,
-    derivatives at the start, results of `decay` or derivatives in the middle.
-    """
+    """Step to a strain of the branch within h; false, unchanged, if the step is too long."""
+    # m: largest stress; share of the interval, negative if unfit; tables; derivatives at the start.
     s, p = c.springs, c.p
     tables, d_first = past(m, 2), past(m, 2 + c.terms * TABLE)
     room, fades = past(d_first, p), c.fade_at and c.drive.pace > 0.0
@@ -237,15 +225,23 @@ def go_to(c, eps, between, m, seed, tol, weight):
 def follow(ints, floats, rows, heights, mass, reals, strains, time, out, log, samples):
     """Follow one spring, without its dashpot, along strains from rest.
 
-    `samples` (n, 4) are derivatives by a shift of the motion, see `histories.at_samples`, then
-    branch and slope dσ/dε, which are filled. Return DONE, NOT_FINITE, or UNFIT if the law needs
-    another solver.
+    `samples` (n, 4) become the derivative by a shift of the motion in contact, as the factors of 1
+    and ε, then branch and slope dσ/dε. Return DONE, NOT_FINITE, or UNFIT if the law needs another
+    solver.
     """
     c = begin_run(ints, floats, time, strains, out, log, rows, heights, mass, reals)
     s, t, tol, n, weight, m = c.springs, c.time, reals[3], c.samples, 0.0, c.batch
     lasts = t[n - 1] - t[0]
     for k in range(c.terms):
         weight += s.g[k] * min(1.0, lasts / s.tau[k])
+    before = 0.0
+    for j in range(n):
+        contact = 1.0 if c.values[j] != 0.0 else 0.0
+        samples[j, 0], samples[j, 1] = contact, 0.0
+        if j > 0 and contact != before:  # it begins or ends before this sample
+            rise = 1.0 / (c.values[j] - c.values[j - 1]) * (contact - before)
+            samples[j, 0], samples[j, 1] = 0.0, rise
+        before = contact
     bring_to(c, 0.0)
     derive(c, start(samples))
     if c.fade_at:
@@ -262,5 +258,5 @@ def follow(ints, floats, rows, heights, mass, reals, strains, time, out, log, sa
         if not m[0] < math.inf:
             for k in range(j, n):
                 out[0, 0, k], samples[k, 2] = math.inf, s.branch
-            return UNFIT if m[1] < 0.0 else NOT_FINITE + c.none
-    return (DONE if is_finite(c, 1) else NOT_FINITE) + c.none
+            return UNFIT if m[1] < 0.0 else run.NOT_FINITE + c.none
+    return (run.DONE if is_finite(c, 1) else run.NOT_FINITE) + c.none

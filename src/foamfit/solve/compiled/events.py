@@ -25,10 +25,7 @@ PLAIN, SAMPLED, DOUBTFUL, FAILED = range(4)  # ends of an attempted step
 
 @entering
 def enter_branch(c, i, up, y):
-    """Leave the branch of a spring at its upper or lower end, and enter the next.
-
-    The derivatives of its held numbers change as well.
-    """
+    """Leave the branch at its upper or lower end; derivatives of held numbers change as well."""
     s, n, p = spring(c, i), numbers(c, i), c.p
     slope = s.slope
     changes = past(s.by, n.parameters)  # no derivatives of a BY_STRESS law
@@ -67,14 +64,6 @@ def _excess(c, i, kind):
 
 
 @inner
-def _happened(c, i, kind):
-    """Whether a spring is past an end or has turned, and not by rounding while it moves away."""
-    over, rate = _excess(c, i, kind), spring(c, i).rate
-    leaves = kind < TURN and over < ROUNDED and (rate < 0.0) == (kind == TOP_END)
-    return over > 0.0 and not leaves
-
-
-@inner
 def _root(c, low, high, i, kind):
     """Return where an excess becomes positive between two shares, by Illinois' method."""
     look(c, high)  # where the values mostly belong to
@@ -106,14 +95,11 @@ def _root(c, low, high, i, kind):
 
 @inner
 def _locate(c, low, high, i, kind):
-    """Return where an excess becomes positive between two shares.
-
-    A spring that begins at an end of its branch may be past it by rounding and yet move away from
-    it. Then the event is where it returns.
-    """
+    """Return where an excess becomes positive between two shares."""
     there = _root(c, low, high, i, kind)
     if kind >= TURN or there - low > AT_ONCE * (high - low):
         return there
+    # A spring past an end by rounding may move away: the event is where it returns.
     part = AT_ONCE * (high - low)
     while part < 0.5 * (high - low):
         part *= 4.0
@@ -137,7 +123,10 @@ def _earliest(c, before, share):
         look(c, found)
     for i in range(c.count):
         for kind in range(RELEASE):
-            if found > before and _happened(c, i, kind):
+            over, falls = _excess(c, i, kind), spring(c, i).rate < 0.0
+            # Past an end by rounding, it moves away.
+            leaves = kind < TURN and over < ROUNDED and falls == (kind == TOP_END)
+            if found > before and over > 0.0 and not leaves:
                 there = _locate(c, before, found, i, kind)
                 if who < 0 or there < found:
                     found, who, what = there, i, kind
@@ -150,11 +139,8 @@ def _earliest(c, before, share):
 
 @inner
 def first_event(c):
-    """Return where in a step its first event is, of which spring (-1: no event) and of which kind.
-
-    A spring may go past the end of its branch and return within the step, or turn twice. So the
-    strains are also judged at their extrema, and the rates at their least.
-    """
+    """Return where in a step its first event is, of which spring (-1: none) and of which kind."""
+    # A spring may pass an end and return, or turn twice, so that extrema are judged as well.
     nobody, before, pieces = -1 + c.none, 0.0, 1
     look(c, 1.0)
     for i in range(c.count):
@@ -195,12 +181,9 @@ def _may_pass(s, dt):
 
 @inner
 def _may_dip(s):
-    """Whether a spring may move against its branch within a step.
-
-    Its rate has the sign of the branch at both ends of the step; the parabola through these and the
-    rate at MIDDLE has its least value there.
-    """
+    """Whether a spring may move against its branch within a step, though not at its ends."""
     start, middle, end = s.turns * s.old_rate, s.turns * s.midway, s.turns * s.rate
+    # The parabola through the rates at both ends and at MIDDLE has its least value there.
     first = (middle - start) / MIDDLE
     bend = (end - middle) / (1.0 - MIDDLE) - first
     if not (start > 0.0 and end > 0.0 and bend > 0.0):

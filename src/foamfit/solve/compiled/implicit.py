@@ -167,10 +167,7 @@ def prepare(c, h):
 
 @inner
 def _improve(c, h, column, tol):
-    """Take one step of Newton's method for the state (column 0) or a derivative; return its size.
-
-    Sizes are relative to the scales, for derivatives also to the largest value so far.
-    """
+    """Take a step of Newton's method for the state (column 0) or a derivative; return its size."""
     wide, base, p, n, reach = c.wide, c.base, c.p, c.carries, c.reach
     rates_at, moves = past(c.stage, wide), past(c.stage, (POINTS + 1) * wide)
     for e in range(SYSTEMS):
@@ -183,6 +180,7 @@ def _improve(c, h, column, tol):
                 value += TO_BASIS[e, i] * (rate - EIGEN[e] * (move / h))
             x[c.places[k]] = value
         substitute(past(c.systems, e * n * (3 * reach + 1)), n, reach, past(c.pivots, e * n), x)
+    # Relative to the scales, for derivatives also to the largest value so far.
     size = most = 0.0
     for k in range(n):
         one, place = (k if column == 0 else base + k * p + column - 1), c.places[k]
@@ -207,11 +205,8 @@ def _improve(c, h, column, tol):
 
 @inner
 def _collocate(c, h, at, tol, want):
-    """Solve one step by Newton's method from the guess in its increments; false if it fails.
-
-    The state is solved first, and from the same values of the springs whether derivatives are
-    wanted or not, so that it does not depend on them.
-    """
+    """Solve one step by Newton's method from the guess in its increments; false if it fails."""
+    # The state must not depend on whether derivatives are wanted, so it is solved first.
     if not _solve(c, h, at, tol, c.none, c.none + 1):
         return False
     if not want:
@@ -331,10 +326,7 @@ def _guess(c, h, last):
 
 @inner
 def _allowed(c, h, excess, tol):
-    """Return the length to use for a step with this error over the tolerance: h to accept it.
-
-    An excessive error is accepted if no shorter step is resolved.
-    """
+    """Return the length to use for a step with this error over the tolerance: h to accept it."""
     r = c.now
     if not excess < math.inf:
         return 0.3 * h
@@ -343,6 +335,7 @@ def _allowed(c, h, excess, tol):
         return max(h * min(max(factor, 0.1), 0.9), floor)
     if excess <= 1.0:
         r.damping = 0.0
+    # An excessive error is accepted if no shorter step is resolved.
     elif excess * tol > r.damping and is_unresolved(c, h):
         r.damped += excess * tol - r.damping
         r.damping = excess * tol

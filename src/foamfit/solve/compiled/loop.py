@@ -1,14 +1,17 @@
-"""The loop over time: steps, events, samples."""
+"""The loop over time: steps, events, samples, and the pieces of a prescribed drive between samples.
+
+A drive whose first sample is not zero takes the springs there on a ramp, while time stands still:
+dashpots, relaxation terms and the rates B and stresses V of laws do nothing, and nodes rest.
+"""
 
 from __future__ import annotations
 
 import math
 
-from foamfit.solve import scene
 from foamfit.solve.compiled import events, run
-from foamfit.solve.compiled.motion import dense, look, rates
-from foamfit.solve.compiled.run import change_branch, numbers, spring, write
-from foamfit.solve.compiled.samples import APPROACH, FLIGHT, INSIDE, is_finite
+from foamfit.solve.compiled.motion import dense, in_contact, look, rates
+from foamfit.solve.compiled.run import MOTION, STRESS, change_branch, numbers, spring, write
+from foamfit.solve.compiled.samples import APPROACH, FLIGHT, INSIDE, KNOWN, is_finite, row_of
 from foamfit.springs.compiled.contract import inner, outer, past, start
 from foamfit.springs.laws.record import BEGUN, STRUCK
 
@@ -20,6 +23,7 @@ FIRST = 40.0  # first implicit step over a short one
 FADES = 5.0  # longest explicit step over a relaxation time; steps are stable up to 6.3
 LEAST_SHARE = 1e-6  # of the largest scale of nodes, see `_fresh_scales`
 SWITCHED, RELEASED, STALLED = 1, 2, 3  # what happened in a step
+RAMP = 1e-9  # time of a ramp over the duration
 
 
 @inner
@@ -40,11 +44,8 @@ def _first_step(c, tol):
 
 @inner
 def _mend(c, y):
-    """Bring what is integrated besides the state back to it: one step of Newton's method.
-
-    So the stress of a BY_STRESS law stays that of its strain, and springs without a dashpot in one
-    group keep one stress. Return whether the state has changed.
-    """
+    """Bring what is integrated besides the state back to it; return whether the state changed."""
+    # By Newton: stresses stay those of strains, and springs without dashpots keep one stress.
     changed = False
     for g in range(c.none if not c.solved else c.groups, c.groups):
         i0, soft, mean, count = c.first[g], 0.0, 0.0, 0
@@ -101,7 +102,7 @@ def _switch(c, i, up, want):
 def _leaves(c, i):
     """Whether a spring at an end of a flat branch leaves it, as a prescribed stress changes."""
     s, way = spring(c, i), c.drive.value_rate
-    if c.top != scene.STRESS or s.eta > 0.0 or s.sigma_low < s.sigma_high:
+    if c.top != STRESS or s.eta > 0.0 or s.sigma_low < s.sigma_high:
         return False
     first, end = c.first[c.groups - 1], s.high if way > 0.0 else s.low
     return i >= first and way != 0.0 and abs(s.eps - end) < events.ROUNDED
@@ -169,15 +170,12 @@ def _finish_step(c, struck):
 
 @inner
 def _fresh_scales(c):
-    """Let the scales of the error cover what the next step may reach.
-
-    A dashpot under a mass that hardly moves makes the base stress of its velocity, so each node has
-    a scale of its own, down to LEAST_SHARE of the largest.
-    """
+    """Let the scales of the error cover what the next step may reach."""
     y, rate, scales, kinds, part = c.y, c.stage, c.scales, c.kinds, 0.1 * c.now.step
     for k in range(c.base):
         kind = kinds[k]
         scales[kind] = max(scales[kind], max(abs(y[k]), part * abs(rate[k])))
+    # A dashpot under a mass that hardly moves makes base stress of its velocity.
     for k in range(2 * c.nodes):
         shared = run.OF_V if k % 2 else run.OF_W
         scales[shared] = max(scales[shared], scales[kinds[k]])
@@ -188,11 +186,8 @@ def _fresh_scales(c):
 
 @inner
 def _longest(c, want):
-    """Return the longest step.
-
-    The error of a step keeps relaxation terms stable, but not their derivatives: near the limit of
-    stability these grow by many steps before that error is seen.
-    """
+    """Return the longest step."""
+    # Near the limit of stability, derivatives of relaxation terms grow before errors are seen.
     longest = math.inf
     if want and c.degree == 0:
         for i in range(c.count):
@@ -234,12 +229,118 @@ def _strike(c, want):
         rates(c, y, c.stage, want, 0.0)
 
 
+# ---------------------------------------------------------------- prescribed drives
+
+
+@inner
+def _begin_piece(c, k):
+    """Prescribe the drive between samples k and k + 1."""
+    r, drive, t, values = c.now, c.drive, c.time, c.values
+    r.now, r.begun, drive.value, drive.value_rate = 0.0, t[k], values[k], 0.0
+    r.horizon, drive.shift, drive.shift_rate = 0.0, in_contact(c, k), 0.0
+    if k + 1 < c.samples:
+        r.horizon = t[k + 1] - t[k]
+        drive.value_rate = (values[k + 1] - values[k]) / (t[k + 1] - t[k])
+        drive.shift_rate = (in_contact(c, k + 1) - drive.shift) / (t[k + 1] - t[k])
+
+
+@inner
+def _begin_ramp(c, want):
+    """Begin a ramp to the first sample of a drive. Under a prescribed stress dashpots are rigid."""
+    r, drive, t = c.now, c.drive, c.time
+    brief = RAMP * (t[c.samples - 1] - t[0]) if c.samples > 1 else RAMP
+    r.now, r.begun, r.horizon, r.piece, r.paused = 0.0, t[0] - brief, brief, -1.0, math.inf
+    c.aside[c.count] = drive.pace
+    drive.value, drive.value_rate, drive.pace = 0.0, c.values[0] / brief, 0.0
+    drive.shift, drive.shift_rate = 0.0, in_contact(c, c.none) / brief
+    for i in range(c.first[c.groups - 1], c.count):
+        s, n = spring(c, i), numbers(c, i)
+        c.aside[i], s.gain = s.eta, 1.0
+        if s.eta > 0.0:
+            s.eta = 0.0 if c.top == MOTION else math.inf
+            n.fixed = int(c.top == MOTION and n.eps_at >= 0)
+    rates(c, c.y, c.stage, want, 0.0)
+
+
+@inner
+def _end_ramp(c, want):
+    """Let time pass again: relaxation terms begin at zero, and dashpots at the present strain."""
+    y, p, aside = c.y, c.p, c.aside
+    rates(c, y, c.stage, want, c.now.now)
+    c.drive.pace, c.now.grow, c.now.paused = aside[c.count], 1.0, 0.0
+    for i in range(c.first[c.groups - 1], c.count):
+        s, n = spring(c, i), numbers(c, i)
+        strain, part = past(c.strain, i * p), past(c.part, i * p)
+        for k in range(c.terms):
+            y[n.z_at + k] = -s.sigma
+            for j in range(p):
+                y[c.base + (n.z_at + k) * p + j] = -(s.steep * strain[j] + part[j])
+        run.sum_gain(c, i)
+        if aside[i] == 0.0:
+            continue
+        s.eta = aside[i]
+        if n.eps_at >= 0 and c.top == MOTION:
+            y[n.eps_at] = s.eps
+            for j in range(p):
+                y[c.base + n.eps_at * p + j] = strain[j]
+        if n.fixed:
+            first, n.fixed = past(s.by, 2), 0
+            for k in range(n.internals if n.internal else c.none):
+                for j in range(p):
+                    y[c.base + (n.x_at + k) * p + j] += first[k] * strain[j]
+
+
+@inner
+def _is_damped(c):
+    """Whether the stress of a spring depends on its strain rate."""
+    damped = False
+    for i in range(c.count):
+        s = spring(c, i)
+        damped = damped or s.eta > 0.0 or s.lossy > 0.0
+    return damped
+
+
+@run.driving
+def next_piece(c, starts, want):
+    """Start from rest, or write a sample and begin a piece; return whether it was the last."""
+    r, k, t = c.now, int(c.now.piece) + 1, c.time
+    if starts:
+        if c.values[0] != 0.0 and (c.top == MOTION or c.top == STRESS):
+            _begin_ramp(c, want)
+            return c.none
+        _begin_piece(c, c.none)
+        rates(c, c.y, c.stage, want, 0.0)
+        write(c, c.y, 0.0, c.none, want)
+        return int(c.samples == 1)
+    if k == 0:  # after a ramp
+        _end_ramp(c, want)
+        _begin_piece(c, k)
+    r.piece, jumps = k, k > 0 and c.top == MOTION and c.groups == 1 and _is_damped(c)
+    if jumps or k == c.samples - 1:
+        write(c, c.y, r.now, k, want)
+    if k == c.samples - 1:
+        return 1
+    if k > 0:
+        _begin_piece(c, k)
+    rates(c, c.y, c.stage, want, 0.0)
+    # Dashpots have the mean rate at a sample where the prescribed rate jumps.
+    if not jumps:
+        write(c, c.y, 0.0, k, KNOWN + c.none)
+    else:
+        share, out = (t[k] - t[k - 1]) / (t[k + 1] - t[k - 1]), row_of(c, c.none, c.none)
+        out[k] += share * (c.carried[0] - out[k])
+        for j in range(c.p):
+            out = row_of(c, 1 + j, c.none)
+            out[k] += share * (c.common[j] - out[k])
+    return c.none
+
+
+# ---------------------------------------------------------------- from step to step
+
+
 @run.advancing
 def advance(c, how, struck, want):
-    """Go to the first event in the step or to its end, and write its samples.
-
-    Return what happened: nothing, an event, the end of contact, or an event without any progress.
-    """
+    """Go to the first event in the step or to its end, write its samples, return what happened."""
     r, share, who, kind = c.now, 1.0, -1, -1
     if how == events.DOUBTFUL:
         share, who, kind = events.first_event(c)
@@ -263,12 +364,12 @@ def advance(c, how, struck, want):
 def _failure(c, how, most):
     """Return how a run ends after a step: DONE if it goes on."""
     if c.drive.flat > 0.0:
-        return c.none + scene.FLAT_UNDER_STRESS
+        return c.none + run.FLAT_UNDER_STRESS
     if how == events.FAILED and not abs(c.new[0]) < math.inf:
-        return c.none + scene.NOT_FINITE
+        return c.none + run.NOT_FINITE
     if c.now.taken >= most:
-        return c.none + scene.TOO_MANY_STEPS
-    return c.none + (scene.STEP_UNDERFLOW if how == events.FAILED else scene.DONE)
+        return c.none + run.TOO_MANY_STEPS
+    return c.none + (run.STEP_UNDERFLOW if how == events.FAILED else run.DONE)
 
 
 @outer
@@ -291,7 +392,7 @@ def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log):
     else:
         done = run.call_drive(c, 1, want)
         r.step = r.horizon
-    outcome, ended = scene.DONE, math.nan
+    outcome, ended = run.DONE, math.nan
     while not (done or (struck and int(r.sample) == c.samples)):
         _fresh_scales(c)
         events.keep_values(c)
@@ -299,11 +400,11 @@ def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log):
         upto = c.time[int(r.sample)] if struck else math.inf
         how = run.call_step(c, want, tol, upto, most)
         outcome = _failure(c, how, most)
-        event = run.call_advance(c, how, struck, want) if outcome == scene.DONE else c.none
+        event = run.call_advance(c, how, struck, want) if outcome == run.DONE else c.none
         stalled = stalled + 1 if event == STALLED else 0
         if stalled > 4 * c.count + 8:
-            outcome = scene.STEP_UNDERFLOW
-        if outcome != scene.DONE or event == RELEASED:
+            outcome = run.STEP_UNDERFLOW
+        if outcome != run.DONE or event == RELEASED:
             ended = r.begun + r.now
             break
         dt = r.step * r.grow
@@ -319,11 +420,7 @@ def integrate(ints, floats, rows, heights, mass, reals, values, time, out, log):
 
 
 def lost(strongest: float, moved: float, damped: float, motion: float, stress: float) -> float:
-    """Return the size of the vibrations that implicit steps damped out, relative to the ranges.
-
-    The arguments are results of a run: largest stress and displacement, vibrations damped out,
-    largest motion and stress of those that a sample lacks.
-    """
+    """Return the size of vibrations that were damped out over the ranges, from results of a run."""
     if motion > 0.0:
         share = motion / moved if moved > 0.0 else 0.0
         damped += max(share, stress / strongest)

@@ -11,8 +11,7 @@ from __future__ import annotations
 import math
 
 from foamfit.solve.compiled import run
-from foamfit.solve.compiled.run import call_inside, numbers, spring
-from foamfit.solve.scene import FREE, MOTION, STRESS, VISCOUS
+from foamfit.solve.compiled.run import FREE, MOTION, STRESS, VISCOUS, call_inside, numbers, spring
 from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import inlined, inner, past
 from foamfit.springs.laws.record import HEAVIER, MOVED, OWN_ETA, OWN_RELAXATION
@@ -104,10 +103,8 @@ def derive_spring(c, i, y):
 
 @inner
 def derive_inside(c, i, y, f, quicker):
-    """Fill the rates of the derivatives of relaxation terms and of internal variables.
-
-    `quicker` are the derivatives of the strain rate, for INTERNAL laws; not read if unknown.
-    """
+    """Fill the rates of the derivatives of relaxation terms and of internal variables."""
+    # `quicker` are the derivatives of the strain rate, only for INTERNAL laws.
     s, n, p = spring(c, i), numbers(c, i), c.p
     part, strain = past(c.part, i * p), past(c.strain, i * p)
     owned, slope = past(c.owned, i * p), s.steep
@@ -140,13 +137,6 @@ def span_of(c, g, y, at):
     if g > 0:
         reach, rate = reach - y[2 * g - 2], rate - y[2 * g - 1]
     return reach, rate
-
-
-@inner
-def is_alone(c, g):
-    """Whether the strain of a group follows from its nodes: one spring, and no massless top."""
-    one = c.first[g + 1] - c.first[g] == 1
-    return one and (g < c.groups - 1 or c.top == FREE or c.top == MOTION)
 
 
 @inlined
@@ -259,11 +249,8 @@ def dense(c, n, x, out):
 
 @inner
 def _stress_of_momentum(c, x):
-    """Return the stress from the acceleration of the striker by an implicit step.
-
-    Where an overdamped contact ends, spring and dashpot carry opposite stresses whose sum has lost
-    its digits.
-    """
+    """Return the stress from the acceleration of the striker by an implicit step."""
+    # At the end of an overdamped contact the sum of spring and dashpot has lost its digits.
     line, wide, rate = c.line, c.wide, 0.0
     for q in range(c.degree - 1, -1, -1):
         rate = rate * x + (q + 1) * line[q * wide + 1]
@@ -284,8 +271,9 @@ def compute_rates(c, y, f, want, at, only):
     for g in range(c.groups):
         if only >= 0 and g != only:
             continue
-        if is_alone(c, g):
-            i = c.first[g]
+        i, several = c.first[g], c.first[g + 1] - c.first[g] > 1
+        massless = g == c.groups - 1 and (c.top == STRESS or c.top == VISCOUS)
+        if not several and not massless:  # its strain follows from its nodes
             if want != ONLY_DERIVATIVES:
                 _follow_one(c, g, i, y, f, want, at)
             if want:

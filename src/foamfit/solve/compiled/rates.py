@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from foamfit.solve.compiled.run import spring
-from foamfit.solve.scene import FREE, STRESS, VISCOUS
+from foamfit.solve.compiled.run import FREE, STRESS, VISCOUS, spring
 from foamfit.springs.compiled.contract import inner
 
 # Ratio of the rates of stopping and of creep above which dashpots stop a striker long before the
@@ -47,11 +46,8 @@ def fastest_rates(
     ends: Sequence[int], mass: Sequence[float], drag: float, top: int, struck: bool,
     duration: float,
 ) -> tuple[float, float]:  # fmt: skip
-    """Estimate the fastest vibration and relaxation of a scene, as rate times duration (radians).
-
-    `first` and `steep` are the slopes of the springs at rest and at most, `mass` that of the nodes;
-    both estimates are infinite if the scene `is_overdamped`.
-    """
+    """Estimate the fastest vibration and relaxation, as rate times duration (radians)."""
+    # `first` and `steep` are the slopes of the springs at rest and at most, `mass` of the nodes.
     if struck and is_overdamped(first, eta, heights, mass[-1]):
         return math.inf, math.inf
     vibration = relaxation = below_stiff = below_damp = 0.0

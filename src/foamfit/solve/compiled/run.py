@@ -25,13 +25,17 @@ from numba import types
 from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import REAL, REALS_AT, WHOLE, address, inner, past, start
 
+# Top of the chain: with a mass, with an onsite damper only, under known stress, in known motion.
+FREE, VISCOUS, STRESS, MOTION = range(4)
+# Outcomes of a run.
+DONE, TOO_MANY_STEPS, STEP_UNDERFLOW, FLAT_UNDER_STRESS, NOT_FINITE, TOO_FAST = range(6)
 # Arrays of floats: numbers that change during a run; blocks of `width` numbers of the springs (see
 # `compiled.contract`); area over mass of the nodes; the drive now; stress of each group;
 # derivatives of the held numbers of each spring; of the stress of each spring at fixed strain, then
 # of its T at fixed strain; of the stress of each group, then zeros and two rows to work with; of
 # the strains; scales of the kinds of components; rates at the stages of a step; its dense output;
 # the state, that at the end of a step, and one between with its rates; zeros; errors; samples that
-# are computed together; what is set aside during a ramp, see `drive`. Those of implicit steps:
+# are computed together; what is set aside during a ramp, see `loop`. Those of implicit steps:
 # Jacobian, n rows of 2 reach + 1; vibrations, see `rates.remember`; values of the derivatives over
 # the scales; a copy of `springs` and `carried`; factored systems, complex, SYSTEMS of n rows of
 # 3 reach + 1, and their right sides.
@@ -55,7 +59,7 @@ ADDRESSES = (
 )  # fmt: skip
 # Place of the row of a law in a block; width of a block; springs; groups; nodes
 # with a state; derivatives; components of the state before the derivatives, if all are integrated,
-# and those that have derivatives; relaxation terms; top, see `solve.scene`; whether the rest of the
+# and those that have derivatives; relaxation terms; top, see above; whether the rest of the
 # state is computed, not integrated; width of a row of stages; degree of the dense output if it is
 # the polynomial of an implicit step, else 0; see `order`; samples; rows of `out`; rows of `log`;
 # and 0, as a literal is of another type, for which functions would be compiled again.
@@ -100,7 +104,7 @@ DRIVE = (
 # of the next step, whether the base stress has risen, last error, next sample, number of the piece;
 # of implicit steps: length of the one before, least length that the error can enforce, length of a
 # short step, short steps in a row, size of the vibrations damped out in the last steps; steps
-# without an attempt of `series`; share of the step that the values belong to.
+# without an attempt of `relaxing_step`; share of the step that the values belong to.
 NOW = (
     "outcome", "ended", "taken", "logged", "finite", "largest", "farthest", "damped",
     "motion_lost", "stress_lost", "now", "begun", "step", "horizon", "grow", "pressed", "last",
@@ -130,10 +134,7 @@ _as_numbers, _as_record = contract.pointing(_NUMBERS), contract.pointing(RECORD)
 
 
 def _pointed(field: str, returns: Any, *takes: Any) -> tuple[Callable[..., contract.Pointed], Any]:
-    """Return a decorator for functions whose address is in a field, and what calls them.
-
-    They take the record and numbers of these types.
-    """
+    """Return a decorator for functions with their address in a field, and what calls them."""
     signature = returns(RECORD, *takes)
 
     def emit(context, builder, given, args):

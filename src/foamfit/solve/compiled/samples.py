@@ -9,8 +9,7 @@ from __future__ import annotations
 import math
 
 from foamfit.solve.compiled.motion import dense, rates_of
-from foamfit.solve.compiled.run import BATCH, numbers, sampling, spring
-from foamfit.solve.scene import FREE, MOTION
+from foamfit.solve.compiled.run import BATCH, FREE, MOTION, numbers, sampling, spring
 from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import inlined, inner, outer, past, start
 from foamfit.springs.laws.record import BEGUN, OWN_ETA, OWN_RELAXATION, STRUCK
@@ -74,10 +73,7 @@ def _put(c, node, k, value, slopes):
 
 @inner
 def write_sample(c, y, at, k, want):
-    """Write sample k from a state at a time since the piece began.
-
-    The values of all springs are KNOWN or computed, with derivatives if they are wanted.
-    """
+    """Write sample k from a state; the values of all springs are computed unless KNOWN."""
     every, p, last = c.shown > 2, c.p, c.groups - 1
     reach = past(c.common, (c.groups + 1) * p)
     if want != KNOWN:
@@ -243,10 +239,8 @@ def _approach(c, speed):
 
 @inner
 def _fly(c, slope):
-    """Write the samples after the end of contact; `slope` is dS/dt there.
-
-    The chain moves with the striker. Derivatives include the shift of the end of contact.
-    """
+    """Write the samples after the end of contact; `slope` is dS/dt there."""
+    # The chain moves with the striker. Derivatives include the shift of the end of contact.
     p, y, now, top, gravity = c.p, c.y, c.now.now, c.groups - 1, c.drive.gravity
     speed, pull, first = y[2 * top + 1], c.stage[2 * top + 1] - gravity, int(c.now.sample)
     for j in range(1 + p):

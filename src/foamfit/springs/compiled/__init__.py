@@ -32,20 +32,13 @@ def compiled(law: Law) -> Compiled:
 
 
 def slopes_of(laws: Sequence[Compiled], rows: Array) -> Array:
-    """Return slopes dσ/dε (Pa) at zero stress of springs with these rows of their laws, (2, n).
-
-    The first is that at rest, the second that of the steepest branch.
-    """
+    """Return slopes dσ/dε (Pa) at zero stress: at rest, and of the steepest branch, (2, n)."""
     found = [[rows.item(i, column) for column in one.slopes] or [1.0] for i, one in enumerate(laws)]
     return np.array([[one[0] for one in found], [max(one) for one in found]])
 
 
 def fill_row(made: Compiled, values: Array, terms: Array, room: int, row: Array) -> bool:
-    """Fill the row of a spring for the solver; return whether it is admissible.
-
-    `values` are the parameters and eta. The row contains eta, `room` relaxation terms (g, τ), and
-    the row of the law.
-    """
+    """Fill a row: eta, `room` relaxation terms, row of the law; return if it is admissible."""
     own, eta = 1 + 2 * room, values.item(-1)
     fine = made.fill(values[:-1], row[own : own + made.columns]) and eta >= 0.0
     row[0] = eta

@@ -13,7 +13,7 @@ from numba import njit
 
 from foamfit.springs.compiled import contract
 from foamfit.springs.compiled.contract import BY, MISS, OF_LAW, SLOPE, Compiled, inner, past, start
-from foamfit.springs.law import admissible, derived_points
+from foamfit.springs.laws.bistable import admissible, derived_points
 
 A, D, C, E = range(4)  # branches of a bistable spring
 LINE, OPEN = range(2)  # of a linear one; OPEN: out of contact
@@ -140,12 +140,6 @@ def begin(row, s):
     return 0.0
 
 
-@contract.settling
-def settle(row, s, eps):
-    s.eps = eps
-    return 0.0
-
-
 @contract.inverting
 def strain(row, s, sigma):
     line = _branch_of(row, s.branch)
@@ -164,7 +158,7 @@ def strain(row, s, sigma):
     return s.high if s.low == -math.inf and sigma >= 0.0 else s.low
 
 
-_FUNCTIONS = (begin, evaluate, switch, settle, strain)
+_FUNCTIONS = (begin, evaluate, switch, contract.settle, strain)
 _SLOPES = tuple(branch * WIDE + _NAMES.index("k") for branch in (A, C, D))
 _STAR = C * WIDE + _NAMES.index("x0")
 COMPILED, LINEAR, UNILATERAL = (

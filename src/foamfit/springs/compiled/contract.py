@@ -41,7 +41,9 @@ and, unless `count` is negative, by parameter `count`.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from inspect import Parameter, Signature
@@ -50,12 +52,11 @@ from typing import Any, NamedTuple
 
 from llvmlite import ir
 from numba import cfunc, njit, types
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
 from numba.core.imputils import lower_setattr_generic
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import infer_getattr, intrinsic, lower_getattr_generic, models, register_model
-
-from foamfit.springs.compiled.parts import PartCompiler
-from foamfit.springs.compiled.stale import drop_stale
 
 HELD, OWN, MEMORY = 6, 8, 48  # memory: on two held numbers, then what the law keeps
 X, MOST_INTERNAL = 64, 32  # internal variables
@@ -88,6 +89,72 @@ EXPLICIT, BY_STRESS, INTERNAL = range(3)
 PATHS, DIRECTION = 2, 3
 BY_STRAIN, ALONG_A, ALONG_B, BY_RATE = range(1, 5)  # rows; the last has one number
 STILL, FADES, FLOWS = range(3)  # internal variables and V: nothing, x decays, or anything else
+PACKAGE = Path(__file__).parents[2]
+FOLDERS = ("springs", "solve")  # subfolders with compiled functions
+SOLVER = PACKAGE / "solve" / "compiled"
+
+
+class _Part(JITCodeLibrary):  # type: ignore[misc]
+    """Code that waits to be linked into that of its callers: as it was written, without address.
+
+    By default numba optimises each function and makes machine code of it, and of all that it calls,
+    before it does so again for the function that calls it. For functions that Python never calls
+    that is wasted, and with it a third of the time of compilation.
+    """
+
+    @property
+    def codegen(self) -> Any:
+        """What gives a function its environment, which only Python would need: nothing here."""
+        return self
+
+    def set_env(self, name: str, environment: object) -> None:
+        """Give no environment."""
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Return no address."""
+        self._ensure_finalized()
+        return 0
+
+    def _optimize_functions(self, module: object) -> None:
+        pass
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+
+class PartCompiler(Compiler):  # type: ignore[misc]
+    """Compile functions of which no machine code is made but within others."""
+
+    def define_pipelines(self) -> Any:
+        """Return the usual passes, which add to code of the kind above."""
+        state = self.state
+        state.library = _Part(state.targetctx.codegen(), state.func_id.func_qualname)
+        return super().define_pipelines()
+
+
+def drop_stale(own: Path) -> None:
+    """Remove files older than the source from the cache `own` of the laws and from the solver's.
+
+    Numba checks only the module of the outermost function, but the records and the inlined
+    functions of other modules are compiled into it: with an old layout it would write past the end
+    of an array.
+    """
+    times = [path.stat().st_mtime for name in FOLDERS for path in (PACKAGE / name).rglob("*.py")]
+    written = max((at for at in times if at <= time.time()), default=0.0)  # a clock may be wrong
+    solver = [SOLVER / own.name]
+    if own.name != "__pycache__":  # the user has named a folder for all caches
+        modules = {path.stem for path in SOLVER.glob("*.py")}
+        known = own.parent.glob("compiled_*/*.nbi")
+        solver = list({path.parent for path in known if path.name.partition(".")[0] in modules})
+    for file in (path for cache in (own, *solver) for path in cache.glob("*.nb[ci]")):
+        with suppress(OSError):  # no permission, or another process was faster
+            if file.stat().st_mtime < written:
+                file.unlink()
+
+
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy", "fastmath": {"contract"}, "no_rewrites": True,
 }  # fmt: skip
@@ -101,11 +168,12 @@ inlined = njit(**_INSIDE, _nrt=False, forceinline=True)
 outer = njit(**OPTIONS, no_cfunc_wrapper=True, _nrt=False, cache=True)
 
 
-def _nothing() -> None:
-    """Tell, compiled by numba, where its cache is."""
+@outer
+def nothing() -> None:
+    """Tell, compiled by numba, where the cache of the laws is."""
 
 
-if (_stats := getattr(outer(_nothing), "stats", None)) is not None:  # None: numba is disabled
+if (_stats := getattr(nothing, "stats", None)) is not None:  # None: numba is disabled
     drop_stale(Path(_stats.cache_path or "."))
 
 REAL, WHOLE = types.float64, types.int64
@@ -187,22 +255,15 @@ def _store(context, builder, signature, args, name):
     return builder.store(args[1], _place(builder, signature.args[0], args[0], name))
 
 
+_PLACES = {
+    name: first + k
+    for first, names in zip(_FIRST, SPRING_FIELDS, strict=True)
+    for k, name in enumerate(names)
+}
 SPRING = Named(
-    "Spring",
-    REAL,
-    {
-        name: first + k
-        for first, names in zip(_FIRST, SPRING_FIELDS, strict=True)
-        for k, name in enumerate(names)
-    },
-    point=EPS,
-    xs=X,
-    g=RELAX,
-    tau=RELAX + MOST_TERMS,
-    results=RESULTS,
-    by_held=RESULTS + BY_HELD,
-    by=RESULTS + BY,
-)
+    "Spring", REAL, _PLACES, point=EPS, xs=X, g=RELAX, tau=RELAX + MOST_TERMS, results=RESULTS,
+    by_held=RESULTS + BY_HELD, by=RESULTS + BY,
+)  # fmt: skip
 
 
 class Compiled(NamedTuple):
@@ -317,10 +378,7 @@ def emitted(signature: Any, emit: Callable[..., Any]) -> Any:
 
 
 def pointed(returns: Any, *takes: Any) -> tuple[Callable[[Callable[..., Any]], Pointed], Any]:
-    """Return a decorator for functions of this signature, and what calls them by their address.
-
-    The address is the first argument of a call.
-    """
+    """Return a decorator for functions of this signature, and a call of the one at an address."""
     return partial(Pointed, returns(*takes)), emitted(returns(WHOLE, *takes), by_address)
 
 
@@ -331,3 +389,10 @@ switching, call_switch = pointed(REAL, REALS_AT, SPRING, WHOLE, REALS_AT)
 beginning, call_begin = pointed(REAL, REALS_AT, SPRING)
 settling, call_number = pointed(REAL, REALS_AT, SPRING, REAL)  #: `settle` or `strain`
 inverting = settling
+
+
+@settling
+def settle(row, s, eps):
+    """Bring a spring to a strain, where nothing else depends on it."""
+    s.eps = eps
+    return 0.0

@@ -9,9 +9,8 @@ compiled once for all, and call it by the address that its spring keeps in memor
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from llvmlite import ir
@@ -21,11 +20,17 @@ from numba.extending import intrinsic
 
 from foamfit.arrays import Array
 from foamfit.springs.compiled import contract
-from foamfit.springs.compiled.bistable import settle
-from foamfit.springs.compiled.contract import BY, EXPLICIT, INTERNAL, SLOPE, inner, past
-
-if TYPE_CHECKING:
-    from foamfit.springs.laws.record import Functions, Law
+from foamfit.springs.compiled.contract import (
+    BY,
+    COMPLEXES_AT,
+    EXPLICIT,
+    INTERNAL,
+    SLOPE,
+    WHOLE,
+    inner,
+    past,
+)
+from foamfit.springs.laws.record import Functions, Law
 
 STEP = 1e-40  # imaginary step
 # What the function of a law fills: σ, V, A and B; the ends of the branch; or the internal variables
@@ -34,26 +39,22 @@ VALUES, ENDS, DOWN, UP = range(4)
 # What a spring of a registered law keeps in memory: the address of its function, kind, numbers of
 # parameters and of internal variables, and whether its branches end.
 FORMULAS, KIND, COUNT, INSIDE, BOUNDED = range(contract.OWN, contract.OWN + 5)
-_AT, _LONG = contract.COMPLEXES_AT, contract.WHOLE
-FORMULA = _LONG(_AT, _LONG, _LONG, _AT)
+FORMULA = WHOLE(COMPLEXES_AT, WHOLE, WHOLE, COMPLEXES_AT)
 FURTHEST, TRIALS = 1e12, 200  # largest strain, and trials, in the search for a strain
 
 
 def _call(context, builder, signature, args):
-    """Call the function of a law, at the address `args[0]`, by numba's own convention.
-
-    An exception, such as that of a division by zero, is not raised: the results keep what they were
-    before.
-    """
+    """Call the function of a law, at the address `args[0]`, by numba's own convention."""
     long, told = ir.IntType(64), ir.IntType(8).as_pointer()
     result = cgutils.alloca_once_value(builder, ir.Constant(long, 0))
     given = [result, cgutils.alloca_once(builder, told), *args[1:]]
     kind = ir.FunctionType(ir.IntType(32), [value.type for value in given])
+    # An exception, as of a division by zero, is not raised: results keep what they were.
     builder.call(builder.inttoptr(args[0], kind.as_pointer()), given)
     return builder.load(result)
 
 
-call_formulas = contract.emitted(contract.WHOLE(contract.WHOLE, *FORMULA.args), _call)
+call_formulas = contract.emitted(WHOLE(WHOLE, *FORMULA.args), _call)
 
 
 @inner
@@ -64,10 +65,7 @@ def ask(s, point, what, out):
 
 @inner
 def gather(row, s, eps, x):
-    """Gather the arguments of the formulas at a point; return them, and room for results.
-
-    They are strain, rate, x and p, at the end of the row.
-    """
+    """Return the arguments of the formulas (strain, rate, x, p), and room for results."""
     inside, count = int(s[INSIDE]), int(s[COUNT])
     point = contract.complexes_at(contract.address(past(row, count + 1)))
     point[0], point[1] = complex(eps, 0.0), complex(s.rate, 0.0)
@@ -126,8 +124,7 @@ def evaluate_explicit(row, s, eps, n, want, out):
     point, found = gather(row, s, 0.0, s)
     for j in range(n):
         point[0] = complex(eps[j], STEP)
-        ask(s, point, VALUES, found)
-        out[contract.OF_LAW * n + j], out[SLOPE * n + j] = found[0].real, found[0].imag / STEP
+        out[contract.OF_LAW * n + j], out[SLOPE * n + j] = stress_of(row, s, point, found)
         if want == 0:
             continue
         point[0] = complex(eps[j], 0.0)
@@ -325,7 +322,7 @@ def _tuple_at(count: int) -> Any:
             at = [builder.gep(args[0], [ir.Constant(ir.IntType(64), k)]) for k in range(count)]
             return context.make_tuple(builder, kind, [builder.load(one) for one in at])
 
-        return kind(contract.COMPLEXES_AT), emit
+        return kind(COMPLEXES_AT), emit
 
     return load
 
@@ -361,15 +358,12 @@ def _formulas(given: Functions, count: int, inside: int) -> Any:
 def compile_law(law: Law) -> contract.Compiled:
     """Compile a registered law."""
     given: Any = law.functions
-    count, inside = len(law.params), law.internal
-    viscous = given.viscous is not None
+    count, inside, viscous = len(law.params), law.internal, given.viscous is not None
     kind, bounded = INTERNAL if inside or viscous else EXPLICIT, float(given.ends is not None)
-    lossy = float(viscous)
     formulas = _formulas(given, count, inside)
     made = formulas.overloads[FORMULA.args]
     where = float(made.library.get_pointer_to_function(made.fndesc.llvm_func_name))  # below 2^53
-
-    begin_any = _begin.address
+    begin_any, lossy = _begin.address, float(viscous)
 
     @cfunc(contract.REAL(contract.REALS_AT, contract.SPRING), **contract.OPTIONS)
     def begin(row, s):
@@ -378,33 +372,25 @@ def compile_law(law: Law) -> contract.Compiled:
         contract.call_begin(begin_any, row, s)
         return 0.0
 
-    functions = (begin, _evaluate, _switch, settle, _strain)
-    addresses = tuple(one.address for one in functions)
+    functions = (begin, _evaluate, _switch, contract.settle, _strain)
+    addresses = np.array([one.address for one in functions])
     kept.append((formulas, begin))  # the addresses stay valid
     # parameters, slope at rest, then room for complex numbers
     columns = count + 1 + 2 * (2 + inside + count + max(3, 2 + 2 * inside))
-    size = contract.RESULTS + contract.results_of(count, inside)
-    fill = _fill(given.admissible, count, addresses, size)
+    work = np.zeros(contract.RESULTS + contract.results_of(count, inside))
+
+    def fill(values: Array, row: Array) -> bool:
+        row[:count] = values
+        fine = np.isfinite(values).all()
+        if not (fine and (given.admissible is None or given.admissible(values))):
+            return False
+        slope = float(slope_at_rest(addresses, row, work))
+        row[count] = slope if 0.0 < slope < math.inf else 1.0
+        return True
+
     flows = contract.FADES if given.decay else contract.STILL
     if given.along or given.viscous or (given.decay and (given.ends or given.switch)):
         flows = contract.FLOWS
     return contract.Compiled(
         fill, kind, columns, count, inside, functions, (count,), -1, viscous, flows
     )
-
-
-def _fill(
-    admissible: Callable[[Array], bool] | None, count: int, addresses: tuple[int, ...], size: int
-) -> Callable[[Array, Array], bool]:
-    """Return the function that writes a row."""
-    where, work = np.array(addresses), np.zeros(size)
-
-    def fill(values: Array, row: Array) -> bool:
-        row[:count] = values
-        if not np.isfinite(values).all() or not (admissible is None or admissible(values)):
-            return False
-        slope = float(slope_at_rest(where, row, work))
-        row[count] = slope if 0.0 < slope < math.inf else 1.0
-        return True
-
-    return fill

@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 import copyreg
-import importlib.util
 import sys
 from collections.abc import Callable, Collection, Mapping
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import ModuleType
 
 from foamfit.errors import InputError
 from foamfit.options import FREED
@@ -152,12 +152,9 @@ def _load(path: str, text: str) -> tuple[Law, ...]:
 def _run(path: str, folder: str, text: str) -> tuple[Law, ...]:
     """Run the text of a law file, and register all of its laws or none."""
     before = dict(_LAWS)
-    name = f"foamfit_law_{Path(path).stem}"
-    spec = importlib.util.spec_from_loader(name, loader=None, origin=path)
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
+    module = ModuleType(f"foamfit_law_{Path(path).stem}")
     module.__file__ = path
-    sys.modules[name] = module
+    sys.modules[module.__name__] = module
     sys.path.insert(0, folder)  # so that it can import modules next to it
     try:
         exec(compile(text, path, "exec"), module.__dict__)

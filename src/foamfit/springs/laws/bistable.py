@@ -10,11 +10,72 @@ from typing import Any
 import numpy as np
 
 from foamfit.arrays import Array, Mask
-from foamfit.springs.law import derived_points
-from foamfit.springs.laws.record import LAST_STRAIN, Between, Compared, Law, Param, PointOf
-from foamfit.springs.laws.shared import K0, KC, steeper
-from foamfit.springs.loop import Loop
+from foamfit.springs.laws.record import LAST_STRAIN, Between, Compared, Law, Loop, Param, PointOf
 from foamfit.springs.spring import Relaxation, Spring, freeze, require
+
+_INNER = (math.log(0.3), math.log(300.0))  # of stiffness divided by largest stress
+K0 = Param(
+    "k0", ("k", "0"), "Pa", "first slope of branch a", (3.0, "slope"), (1e-3, 1e4), "stress",
+    inner=_INNER, branch="a", example="5.5 MPa",
+)  # fmt: skip
+KC = Param(
+    "kc", ("k", "c"), "Pa", "first slope of branch c", (20.0, "slope"), (1e-2, 1e5), "stress",
+    inner=_INNER, branch="c", example="82.5 MPa",
+)  # fmt: skip
+
+
+# ---------------------------------------------------------------- formulas, compiled as well
+
+
+def derived_points(
+    k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
+) -> tuple[float, float, float, float, float]:
+    """Return σ_a and σ̄_c (Pa), ε_*, ε̂_a (-inf: e never meets a) and ε̂_c (eqs. 4 and 5).
+
+    Both quadratic equations are written relative to the known end of the branch (C2 for ε̂_c, A1 for
+    ε̂_a), so that their coefficients contain no difference of nearly equal numbers.
+    """
+    sigma_a = k0 * eps_a / (1.0 - eps_a)
+    sigma_c = sigma_a + dsigma
+    eps_star = eps_c - sigma_c / (kc + sigma_c)
+
+    # Eq. 5, c = d. With y = ε - ε_c and u = 1 - (ε_c - ε_*) = kc/(kc + σ̄_c):
+    # u kh+ y² + (kc - u² kh+ + u gap) y - u² gap = 0, one root y >= 0.
+    gap = kh_plus * (eps_c - eps_a) - dsigma
+    u = kc / (kc + sigma_c)
+    b = kc - u * u * kh_plus + u * gap
+    root = math.sqrt(b * b + 4.0 * u * kh_plus * u * u * gap)
+    y = 2.0 * u * u * gap / (b + root) if b >= 0.0 else (root - b) / (2.0 * u * kh_plus)
+
+    # Eq. 4, a = e. With z = ε_a - ε and v = 1 - ε_a:
+    # v kh- z² + (v² kh- + v fall - k0) z + v² fall = 0, the smaller root z >= 0, if any.
+    fall = kh_minus * (eps_c - eps_a) - dsigma
+    v = 1.0 - eps_a
+    b = v * v * kh_minus + v * fall - k0
+    discriminant = b * b - 4.0 * v * kh_minus * v * v * fall
+    if fall == 0.0:
+        eps_hat_a = eps_a
+    elif b < 0.0 and discriminant >= 0.0:
+        eps_hat_a = eps_a - 2.0 * v * v * fall / (math.sqrt(discriminant) - b)
+    else:
+        eps_hat_a = -math.inf
+    return sigma_a, sigma_c, eps_star, eps_hat_a, eps_c + y
+
+
+def admissible(
+    k0: float, kc: float, dsigma: float, eps_a: float, eps_c: float, kh_plus: float, kh_minus: float
+) -> bool:
+    """Return whether the seven parameters are admissible (docs/theory.md)."""
+    # The other conditions follow: branch d lies above C2 and branch e below A1.
+    return (
+        0.0 < k0 < math.inf
+        and 0.0 < kc < math.inf
+        and 0.0 < eps_a < 1.0
+        and eps_a < eps_c < math.inf
+        and -k0 * eps_a / (1.0 - eps_a) < dsigma <= 0.0
+        and 0.0 <= kh_plus < math.inf
+        and 0.0 <= kh_minus < math.inf
+    )
 
 
 def _point(place: int, what: str) -> Any:
@@ -187,10 +248,8 @@ def read_in_series(loop: Loop, marks: Array, share: float) -> Array:
 
 
 def _stiffness_between(rise: float, low: float, high: float) -> float:
-    """Return k_c of a branch c whose strain grows by `rise` from stress `low` to `high` (Pa).
-
-    It is the larger root k of rise (k+low)(k+high) = k (high-low), or √(low high) without a root.
-    """
+    """Return k_c of a branch c whose strain grows by `rise` from stress `low` to `high` (Pa)."""
+    # The larger root k of rise (k+low)(k+high) = k (high-low), or √(low high) without a root.
     gain = max(high - low, 1e-9 * high)
     rise = max(rise, 1e-6)
     b = gain - rise * (low + high)
@@ -200,9 +259,27 @@ def _stiffness_between(rise: float, low: float, high: float) -> float:
     return float((b + np.sqrt(discriminant)) / (2.0 * rise))
 
 
+# k_c of further start points, divided by the largest stress.
+STEEP = np.geomspace(1.0, 1000.0, 7)
+
+
+def steeper(values: Array, start: int, top: float, low: float) -> Iterator[Array]:
+    """Yield springs with another k_c whose branch c has the same strain at the largest stress.
+
+    A search that changes only k_c misses a steep branch c. `start` is the index of the strain at
+    which branch c begins, at the stress `low`; k_c is the second parameter.
+    """
+    for other in top * STEEP:
+        moved = values.copy()
+        moved[1] = other
+        rises = [top / (k + top) - low / (k + low) for k in (values[1], other)]
+        moved[start] += rises[0] - rises[1]
+        yield moved
+
+
 def _neighbours(values: Array, top: float) -> Iterator[Array]:
     k0, _, dsigma, eps_a = values[:4]
-    return steeper(values, 1, 4, top, _sigma_a(k0, eps_a) + dsigma)
+    return steeper(values, 4, top, _sigma_a(k0, eps_a) + dsigma)
 
 
 def _likely(values: Array, seen: Mask, marks: Array) -> Array:
@@ -222,10 +299,7 @@ def _likely(values: Array, seen: Mask, marks: Array) -> Array:
 
 
 def _fewer(values: Array, top: float) -> Iterator[Array]:
-    """Yield a spring that stays on branches a and d up to a stress, and one that stays on a.
-
-    Both have the same strain at this stress as the spring of `values`.
-    """
+    """Yield springs of the same strain at a stress: one on branches a and d, and one on a only."""
     k0, kc, dsigma, eps_a, eps_c, kh_plus, kh_minus, eta = values
     sigma_a = _sigma_a(k0, eps_a)
     sigma_c, far = sigma_a + dsigma, 0.9 * LAST_STRAIN

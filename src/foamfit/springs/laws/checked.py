@@ -78,11 +78,8 @@ def _missing(law: Law) -> str | None:
 
 
 def _overrun(law: Law, values: Array) -> str | None:
-    """Return what is wrong with the indices in the functions, or None.
-
-    Compiled functions do not check indices and could write outside an array. The functions are
-    therefore first run as they are, on every branch.
-    """
+    """Return what is wrong with the indices in the functions, or None."""
+    # Compiled functions could write outside an array, so they first run as they are.
     given: Any = law.functions
     own = {name: getattr(one, "py_func", one) for name, one in given._asdict().items() if one}
     p, rate = tuple(values.astype(complex).tolist()), 1.0 + 0j
@@ -121,7 +118,9 @@ def _trial(law: Law) -> str | None:
     except InputError:
         return f"admissible refuses its own start values ({shown}); give others"
     except Exception as error:  # any error of the compiler in a user's function
-        return f"its functions cannot be compiled or run ({type(error).__name__}: {_told(error)})"
+        told = re.sub("\x1b\\[[0-9;]*m", "", str(error)).split()  # without the compiler's colours
+        what = f"{type(error).__name__}: {' '.join(told)[:300]}"
+        return f"its functions cannot be compiled or run ({what})"
     if (at := first_infinite(stress)) is not None:
         return f"the stress is not finite at the strain {TRIED[at]:g} ({shown})"
     if branches.min() < 0 or branches.max() >= len(law.branches):
@@ -135,11 +134,6 @@ def _trial(law: Law) -> str | None:
             f"({shown}); a branch must rise with the strain"
         )
     return None
-
-
-def _told(error: Exception) -> str:
-    """Return the message of an error on one line, without the compiler's colours."""
-    return " ".join(re.sub("\x1b\\[[0-9;]*m", "", str(error)).split())[:300]
 
 
 def check(law: Law, taken: Sequence[str]) -> Law:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from foamfit.springs.laws.bistable import K0
 from foamfit.springs.laws.record import Law
-from foamfit.springs.laws.shared import K0
 from foamfit.springs.spring import Relaxation, Spring, freeze
 
 

@@ -12,17 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from foamfit.arrays import Array
-from foamfit.springs.law import most_beyond
-from foamfit.springs.laws.record import LAST_STRAIN, Between, Law, Param
-from foamfit.springs.laws.shared import K0, KC, steeper
-from foamfit.springs.loop import Loop
-from foamfit.springs.spring import (
-    Relaxation,
-    Spring,
-    as_samples,
-    freeze,
-    require,
-)
+from foamfit.springs.laws.bistable import K0, KC, steeper
+from foamfit.springs.laws.record import LAST_STRAIN, Between, Law, Loop, Param
+from foamfit.springs.spring import Relaxation, Spring, as_samples, freeze, require
 
 
 @dataclass(frozen=True)
@@ -154,6 +146,47 @@ class MicroscaleSpring(Spring):
         )
 
 
+def most_beyond(k: float, kc: float, n: float) -> tuple[float, float]:
+    """Return the least ε_* with which branch c never lies before branch a, and its stress.
+
+    It is the maximum over σ of the difference
+    f(σ) = a(σ; k) - σ/(kc+σ) with a = 1 - (1 + nσ/k)^(-1/n). It rises where
+    g(σ) = 2 ln(kc+σ) - ln(k kc) - (1+1/n) ln(1+nσ/k) is positive; g turns once at most, so f has
+    one maximum at most.
+    """
+    if n == 1.0:
+        one, other = math.sqrt(k), math.sqrt(kc)
+        return max(0.0, (other - one) / (other + one)), one * other
+
+    def rises(sigma: float) -> float:
+        gains = 2.0 * math.log(kc + sigma) - math.log(k) - math.log(kc)
+        return gains - (1.0 + 1.0 / n) * math.log1p(n * sigma / k)
+
+    turn = ((1.0 + n) * kc - 2.0 * k) / (n - 1.0)  # of g
+    if n > 1.0:  # g falls up to its turn, and is negative there
+        if kc <= k:
+            return 0.0, 0.0
+        low, high = 0.0, turn
+    else:  # g rises up to its turn, if that is at a stress at all, and falls without end
+        low = max(turn, 0.0)
+        if rises(low) <= 0.0:
+            return 0.0, 0.0
+        high = max(low, k, kc)
+        while rises(high) > 0.0 and high < 1e300:
+            high *= 2.0
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        if not low < middle < high:
+            break
+        if rises(middle) > 0.0:
+            low = middle
+        else:
+            high = middle
+    sigma = 0.5 * (low + high)
+    excess = -math.expm1(-math.log1p(n * sigma / k) / n) - sigma / (kc + sigma)
+    return max(excess, 0.0), sigma
+
+
 @lru_cache(maxsize=256)
 def _least_star(k0: float, kc: float, stiffening: float = 1.0, softening: float = 0.0) -> float:
     """Return the least ε_*, with which branch c never lies before branch a."""
@@ -162,7 +195,7 @@ def _least_star(k0: float, kc: float, stiffening: float = 1.0, softening: float 
 
 def _neighbours(values: Array, top: float) -> Iterator[Array]:
     """Yield springs with a steeper branch c, and one that snaps back where it snaps."""
-    yield from steeper(values, 1, 2, top, 0.0)
+    yield from steeper(values, 2, top, 0.0)
     back = values.copy()
     back[5:7] = values[3:5]
     yield back
@@ -256,11 +289,6 @@ _NOTE = (
 )
 
 
-def _marked(param: Param, mark: float) -> float:
-    """Return the start value of an optional parameter for a mark in [0, 1]."""
-    return 3.0 ** (2.0 * mark - 1.0) if param.is_logarithmic else param.start_limits[1] * mark
-
-
 def _law(*options: str) -> Law:
     """Return the law with the parameters of some options; without any, the basic law."""
     extra = tuple(param for option in options for param in _OPTIONAL[option])
@@ -286,7 +314,10 @@ def _law(*options: str) -> Law:
         last, top = float(np.max(loop.strain)), scales.stress
         first = max(loop.at(0.05 * last, loading=True), 0.002 * top) / (0.05 * last)
         k0, kc = first * 10.0 ** (1.2 * marks[0] - 0.4), top * 10.0 ** (2.3 * marks[1] - 0.5)
-        more = dict(zip(names, map(_marked, extra, marks[7:]), strict=True))
+        more = {
+            p.name: 3.0 ** (2.0 * mark - 1.0) if p.is_logarithmic else p.start_limits[1] * mark
+            for p, mark in zip(extra, marks[7:], strict=True)
+        }
         lowest = least(k0, kc, *(more[name] for name in also))
         star = lowest + 0.5 * marks[2] * (LAST_STRAIN - lowest)
         plus = max(loop.at((0.2 + 0.8 * marks[3]) * last, loading=True), 0.02 * top)
