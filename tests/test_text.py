@@ -6,7 +6,7 @@ import pytest
 
 import fabricated
 from foamfit import text as t
-from foamfit.report.readable import in_unit, readable
+from foamfit.report.render import in_unit, readable
 
 
 def ranged(low: float, high: float, unit: str = "Pa") -> str:

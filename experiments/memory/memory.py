@@ -16,7 +16,7 @@ import pandas as pd
 
 import foamfit as ff
 from foamfit.data.cycles import cycles_of
-from foamfit.report.studies.prediction import plot_prediction
+from foamfit.report.prediction import plot_prediction
 from foamfit.results import Fit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

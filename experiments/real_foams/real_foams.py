@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 
 import foamfit as ff
 from foamfit.parts import ParameterEstimate
-from foamfit.report.readable import readable
+from foamfit.report.render import readable
 from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
 

@@ -6,8 +6,8 @@ from .data.csv_file import read_test as read_test
 from .data.measurement import Measurement as Measurement
 from .errors import InputError as InputError, SimulationError as SimulationError
 from .fitting.problem import make_params as make_params
-from .report.studies.plan import Plan as Plan
-from .report.studies.prediction import Prediction as Prediction
+from .report.plan import Plan as Plan
+from .report.prediction import Prediction as Prediction
 from .solve.simulation import Response as Response, simulate as simulate
 from .springs.chain import (
     Chain as Chain,
@@ -27,10 +27,10 @@ from .springs.laws import (
 from .springs.published import published as published
 from .study.batch import batch as batch
 from .study.cycles import CycleFits as CycleFits, fit_cycles as fit_cycles
+from .study.identified import load as load
 from .study.joint import joint as joint
 from .study.joint_result import JointResult as JointResult
 from .study.plan import plan as plan
 from .study.predict import predict as predict
-from .study.saved import load as load
 
 __version__: str

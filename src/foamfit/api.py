@@ -17,9 +17,8 @@ from foamfit.one_model import SEARCHED, Options, Progress, identify, judge, part
 from foamfit.options import Keywords, documented
 from foamfit.report.folder import Result, brief, write_result
 from foamfit.report.plots import draw_panel
-from foamfit.report.readable import readable
+from foamfit.report.render import frame, readable
 from foamfit.report.summary import misfit_words, misfits, summary_text
-from foamfit.report.tables import frame
 from foamfit.results import Fit
 from foamfit.solve.precompile import compile_solver
 from foamfit.springs.parameters import unit_of

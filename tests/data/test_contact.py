@@ -440,3 +440,10 @@ def test_any_length_of_rest_shows_the_same_contact(kind):
         found.append(rise_of(time[first:], values[first:], noise, before, 1e-2 / before**0.5))
     assert found[0] == pytest.approx(found[1], abs=0.5 * found[1][1])
     assert abs(found[0][0]) < 3.0 * found[0][1]
+
+
+def test_a_rest_longer_than_the_way_to_the_peak_shows_no_rise():
+    """The width of the mean over these rows was zero."""
+    noise = estimated_noise(np.random.default_rng(0).standard_normal(100))
+    values = np.concatenate([[0.0, 1.0], np.zeros(100)])
+    assert rise_of(np.arange(102.0), values, noise, 50, None) is None

@@ -49,6 +49,8 @@ def expect(test):
         "#Time..ms.,Stress..MPa.,Displacement..mm.",
         "Time/ms,Stress/MPa,Displacement/mm",
         "t/ms,nominal stress/N/mm^2,Top displacement /mm",
+        "t [ms],σ [MPa],disp [mm]",
+        "time (ms),|stress| (MPa),displacement (mm)",
     ],
 )
 def test_units_stand_in_the_headers(tmp_path, header):
@@ -336,3 +338,23 @@ def test_syntactic_foam_has_no_time_and_no_unloading(tmp_path):
     assert len(test.stress) == 1186
     assert test.stress.max() == pytest.approx(144.348e6)
     assert any("no unloading" in note for note in test.notes)
+
+
+def test_a_stray_quote_in_the_header_is_refused(tmp_path):
+    """Blanks were replaced by tabs again and again."""
+    header = '"time (ms)\tstress (MPa)\tdisplacement (mm)'
+    refused(write(tmp_path, header, numbers("\t")), "no row names the columns")
+
+
+@pytest.mark.parametrize("largest", ["1.7e308", "-1.7e308"])
+def test_a_number_beyond_every_unit_is_refused(tmp_path, largest):
+    rows = numbers()
+    rows[20] = f"20,{largest},4"
+    rows[21] = f"21,{largest.removeprefix('-')},4"
+    refused(write(tmp_path, rows=rows), "'stress (MPa)' is up to 1.7e+308", "cannot be a stress")
+
+
+@pytest.mark.parametrize("header", ["Strain%", "ε [%]", "ε/%"])
+def test_a_strain_in_per_cent_may_be_a_letter_or_have_no_blank(tmp_path, header):
+    test = read_test(write(tmp_path, f"time (ms),stress (MPa),{header}"))
+    assert test.displacement.max() / test.specimen.height == pytest.approx(0.04)

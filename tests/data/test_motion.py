@@ -8,7 +8,7 @@ import pytest
 
 from conftest import HEIGHT, synthetic_loop
 from foamfit.data.cycles import loading_rate
-from foamfit.data.measurement import NoiseLevel
+from foamfit.data.measurement import Noise, NoiseLevel
 from foamfit.data.motion import SmoothMotion, follow
 from foamfit.data.noise import estimated_noise, with_noise
 
@@ -171,3 +171,10 @@ def test_the_rate_of_several_cycles_is_that_of_the_first():
     strain = np.interp(time, [0.0, 2.0, 2.4, 3.8, 4.2], [0.0, 0.5, 0.0, 0.502, 0.0])
     noisy = strain + 1e-4 * np.random.default_rng(0).standard_normal(time.size)
     assert loading_rate(moved(time, noisy)) == pytest.approx(0.25, rel=0.02)
+
+
+def test_a_motion_whose_peak_lies_in_its_rest_has_no_rate():
+    """Of three rows within the noise of the peak, one was the last of the rest."""
+    test = moved(np.array([0.0, 1.0, 2.0, 3.0, 4.0]), np.array([0.5, 0.1, 0.0, 2.0, -0.3]))
+    quiet = replace(test, noise=Noise(displacement=0.01 * HEIGHT))
+    assert loading_rate(quiet) is None

@@ -279,3 +279,46 @@ def test_what_smells_wrong_is_noted(specimen, striker, words):
     told = (*done.notes, *audit(done).warnings())
     assert any(note.startswith("Check:") and words in note for note in told)
     assert not any(note.startswith("Check:") for note in run(impact()).notes)
+
+
+@pytest.mark.parametrize("striker", [None, STRIKER])
+@pytest.mark.parametrize("spikes", [[0], [-1], [90], [40, 120]])
+@pytest.mark.parametrize("channel", ["stress", "displacement"])
+def test_a_channel_that_is_constant_but_for_single_rows_is_refused(channel, spikes, striker):
+    loop = np.sin(np.linspace(0.0, np.pi, 200))
+    flat = np.full(200, 0.5) + 1e-16 * loop
+    flat[spikes] = 0.9
+    scaled = {"stress": 1e6 * loop, "displacement": 4e-4 * loop}
+    scaled[channel] *= flat / loop.clip(1e-9)
+    record = Record(np.linspace(0.0, 1e-3, 200), **scaled)
+    with pytest.raises(InputError, match=f"the {channel} is constant but for single rows"):
+        condition(record, SPECIMEN, striker=striker)
+
+
+def test_a_tiny_impact_is_refused():
+    """Seven rows have no tail of eight, from which a zero was to be taken."""
+    with pytest.raises(InputError, match="at least 10 needed"):
+        run(impact(n=6))
+
+
+def test_a_gauge_that_moves_only_after_contact_is_refused():
+    record = impact(before=0.5, after=1.0)
+    dead = np.where(record.time < 1.5 * DURATION, 0.0, record.displacement)
+    with pytest.raises(InputError, match="the displacement does not vary in the part that is used"):
+        run(replace(record, displacement=dead))
+
+
+@pytest.mark.parametrize(("offset", "told"), [(-0.2, "starts below zero, at −1"), (0.2, "17 %")])
+def test_a_slow_record_that_starts_with_a_stress_is_doubted(offset, told):
+    """A zero of the force that was never set moved all stresses, and nothing was said."""
+    loop = np.sin(np.linspace(0.0, np.pi, 200))
+    done = condition(Record(None, 1e5 * (loop + offset), 4e-4 * loop), SPECIMEN)
+    (note,) = (one for one in done.notes if one.startswith("Check:"))
+    assert told in note
+
+
+def test_an_impact_that_is_mostly_at_its_largest_stress_is_one_contact():
+    """Its median was taken for the unloaded level, so that no contact was left."""
+    record = impact()
+    clipped = np.minimum(record.stress, np.quantile(record.stress, 0.4))
+    assert run(replace(record, stress=clipped)).stress.max() == pytest.approx(clipped.max())

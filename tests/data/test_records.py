@@ -13,8 +13,7 @@ from foamfit.data.csv_file import read_test
 from foamfit.data.energy import audit
 from foamfit.errors import InputError
 from foamfit.fitting.curves import check_drive
-from foamfit.report.described import describe
-from foamfit.report.summary import render_report, summary_text
+from foamfit.report.summary import describe, render_report, summary_text
 
 
 def table(*columns, header=HEADER):

@@ -9,7 +9,7 @@ from conftest import refused, write_csv
 from foamfit.data.csv_file import read_test
 from foamfit.data.energy import audit
 from foamfit.errors import InputError
-from foamfit.report.described import describe
+from foamfit.report.summary import describe
 
 LOOP = np.sin(np.linspace(0.0, np.pi, 41))
 TIME = np.arange(41) * 1e-3

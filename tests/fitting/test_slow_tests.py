@@ -231,3 +231,30 @@ def test_a_bistable_fit_says_what_partial_unloading_leaves(inner: ff.Measurement
     assert f"these 45 % of the samples account for {100.0 * inside:.2g} % of the squared" in told
     assert "microscale springs do" in told
     assert told in " ".join(summary_text(fit, verbose=True).split())
+
+
+@pytest.mark.parametrize("drive", [None, "stress"])
+def test_a_record_of_the_unloading_alone_is_refused(drive):
+    falling = np.linspace(1.0, 0.0, 120)
+    motion = 0.1 * HEIGHT * (falling - 1.0)
+    test = loop_measurement(1e6 * falling, motion, SPECIMEN)
+    with pytest.raises(ff.InputError, match="the displacement does not rise"):
+        ff.fit(test, drive=drive, starts=1, intervals="local")
+
+
+def test_a_displacement_of_picometres_is_no_defect(tmp_path):
+    """The limits of its zero were equal for lmfit, which raised an error of its own."""
+    noise = 0.3 * np.random.default_rng(0).standard_normal(TIME.size)
+    columns = TIME, 100.0 * STRAIN + noise, 1e-9 * STRAIN
+    path = write_csv(tmp_path / "slow.csv", HEAD, *columns, toml=TOML)
+    result = ff.fit(ff.read_test(path), starts=1, intervals="local")
+    assert result.status == "failed"
+    assert "displacement_zero" not in result.parameters
+
+
+def test_a_fit_to_a_stress_of_an_absurd_size_is_refused():
+    """The limits of a stiffness of 1e-18 Pa were equal for lmfit."""
+    loop = np.sin(np.linspace(0.0, np.pi, 120))
+    test = loop_measurement(1e-18 * loop, 1e-3 * loop, SPECIMEN)
+    with pytest.raises(ff.InputError, match=r"cannot be searched between .*; check the units"):
+        ff.fit(test, starts=1, intervals="local")

@@ -13,7 +13,7 @@ import pytest
 import fabricated
 from conftest import run, without_pictures, write_csv
 from foamfit.report.plots import figures_of
-from foamfit.report.readable import readable
+from foamfit.report.render import readable
 from foamfit.report.summary import render_report, summary_text
 
 

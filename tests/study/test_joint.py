@@ -344,8 +344,8 @@ def test_joint_json_has_how_parameters_vary_together(found):
     assert said["names"] == ["s1_kc", "s1_sigma_minus"]
     matrix = np.array(said["correlation"])
     assert np.diag(matrix) == pytest.approx(1.0)
-    assert read_source(found).changing == tuple(said["names"])
-    np.testing.assert_allclose(read_source(found).together, matrix)
+    assert read_source(found).specimens[0] == tuple(said["names"])
+    np.testing.assert_allclose(read_source(found).specimens[1], matrix)
 
 
 def test_a_test_with_a_wrong_scale_of_the_force_is_named(tmp_path):

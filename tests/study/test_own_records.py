@@ -113,8 +113,8 @@ def test_an_unseen_impact_is_aligned_before_it_is_compared(together, fitted):
 
 def test_nothing_of_a_record_is_carried_to_another(together, fitted):
     source = read_source(fitted)
-    assert not {*source.parameters, *source.names} & NUISANCE.keys()
-    assert set(source.names) == set(fitted.correlation.names) - NUISANCE.keys()
+    assert not {*source.parameters, *source.correlation[0]} & NUISANCE.keys()
+    assert set(source.correlation[0]) == set(fitted.correlation.names) - NUISANCE.keys()
     # the same impact written in two ways gets the same prediction
     folder, records, _ = together
     other = folder / "other"

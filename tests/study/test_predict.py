@@ -17,9 +17,8 @@ from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement, Noise, Specimen
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.problem import make_problem
-from foamfit.report.studies import prediction as prediction_report
-from foamfit.study.identified import read_source
-from foamfit.study.population import Population
+from foamfit.report import prediction as prediction_report
+from foamfit.study.identified import Population, read_source
 
 HEIGHT, AREA, SIGMA = 10e-3, 5e-5, 1e3
 LAW = {

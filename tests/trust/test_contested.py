@@ -11,6 +11,7 @@ import foamfit as ff
 import records
 import rig
 from conftest import DATA, needs_data, run, without_pictures
+from foamfit.data.energy import audit
 
 QUICK = {"starts": 2, "intervals": "local"}
 
@@ -98,6 +99,19 @@ def test_a_varied_number_settles_it_and_is_found(
         assert abs(item.value - truth[f"s1_{spring}"]) < 4 * item.stderr
     assert not any("impulse" in one or "given as" in one for one in result.warnings)
     assert not any("--time-shift" in one for one in result.warnings)
+
+
+def test_a_contradicted_impact_without_its_rebound_is_reported(tmp_path: Path) -> None:
+    """The sentence on the balance needed a ratio, which only the rebound shows."""
+    made = record_of(2, force=2.0)
+    path = rig.write(made, tmp_path)
+    rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    path.write_text("".join(rows[: 1 + len(rows) // 2]), encoding="utf-8")
+    test = ff.read_test(path)
+    assert audit(test).impulse_ratio is None
+    result = ff.fit(test, **QUICK)
+    (check,) = (one for one in result.checklist if one.key == "impulse")
+    assert check.sentence == "Force and motion contradict each other."
 
 
 def test_a_lag_of_the_force_determines_nothing_until_it_is_fitted(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker
 from foamfit.one_model import Options, identify, judge
 from foamfit.report.folder import load_result
-from foamfit.report.readable import readable
+from foamfit.report.render import readable
 from foamfit.trust.best_point import BestPoint
 from foamfit.trust.covariance import RULE, Block, Uncertainty, covariance
 from foamfit.trust.intervals import Choice

@@ -1,5 +1,4 @@
-"""Material cards of a fitted law for finite elements, and their deviation from the law.
+"""Material cards of a fitted law for finite elements.
 
-`loading` computes the loading curves, evaluates a card as its solver does and fits its unloading;
-`card` writes the files. The texts of the cards are templates.
+`loading` computes and fits their curves as each solver does; `card` writes the files by templates.
 """

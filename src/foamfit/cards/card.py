@@ -27,9 +27,8 @@ from foamfit.report.panels import AXES, Line, Panel
 from foamfit.report.plots import panelled
 from foamfit.report.render import environment, sentences
 from foamfit.results import Fit
-from foamfit.study.identified import read_source
+from foamfit.study.identified import load, read_source
 from foamfit.study.joint_result import JointResult
-from foamfit.study.saved import load
 from foamfit.text import percent, significant
 
 if TYPE_CHECKING:
@@ -42,6 +41,22 @@ LOOKS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("card", {"color": BLUE, "lw": 1.0, "ls": (0, (5, 1.2))}),
 )
 MOST = 2  # records drawn: the slowest and the fastest
+# File suffix, comment sign and placeholder of an unknown density of each format. The placeholder is
+# an undefined parameter, which the solvers reject.
+FORMATS = {
+    "mat083": (".k", "$", "&RHO"),
+    "mat057": (".k", "$", "&RHO"),
+    "law90": (".rad", "#", "&RHO"),
+    "abaqus": (".inp", "**", "<RHO>"),
+    "csv": (".csv", "#", ""),
+}
+# Mass, length, time and stress of the unit systems.
+UNITS = {
+    "kg-mm-ms": ("kg", "mm", "ms", "GPa"),
+    "t-mm-s": ("t", "mm", "s", "MPa"),
+    "SI": ("kg", "m", "s", "Pa"),
+}
+_LINE = 78  # most characters of a comment
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,30 +125,9 @@ def read_records(result: object) -> list[Record]:
     raise InputError(f"a card needs a result of fit or joint, not {result!r}")
 
 
-# File suffix, comment sign and placeholder of an unknown density of each format. The placeholder is
-# an undefined parameter, which the solvers reject.
-FORMATS = {
-    "mat083": (".k", "$", "&RHO"),
-    "mat057": (".k", "$", "&RHO"),
-    "law90": (".rad", "#", "&RHO"),
-    "abaqus": (".inp", "**", "<RHO>"),
-    "csv": (".csv", "#", ""),
-}
-# Mass, length, time and stress of the unit systems.
-UNITS = {
-    "kg-mm-ms": ("kg", "mm", "ms", "GPa"),
-    "t-mm-s": ("t", "mm", "s", "MPa"),
-    "SI": ("kg", "m", "s", "Pa"),
-}
-_LINE = 78  # most characters of a comment
-
-
 @dataclass(frozen=True, eq=False)
 class Card:
-    """A material card; only its text is in `units`, everything else is in SI.
-
-    `misfit` contains the RMS over the measured range of fit and card, over all tests.
-    """
+    """A material card; only its text is in `units`, everything else is in SI."""
 
     name: str
     format: str
@@ -141,7 +135,7 @@ class Card:
     law: str
     curves: loading.Curves
     unloading: loading.Unloading
-    misfit: dict[str, float | None]
+    misfit: dict[str, float | None]  #: RMS over the measured range of fit and card, over all tests
     density: float | None
     warnings: tuple[str, ...]
     records: tuple[Record, ...]
@@ -199,10 +193,7 @@ class Card:
         return "\n".join(sentences("terminal", card=self))
 
     def save(self, path: str | Path) -> Path:
-        """Write the card, PATH.json, PATH.png and PATH.pdf; return the path.
-
-        Raises InputError, before anything is written, if permissions forbid one of the files.
-        """
+        """Write the card, PATH.json, .png and .pdf; InputError first if one cannot be written."""
         path = Path(path)
         files = [path, *(Path(f"{path}.{form}") for form in ("json", "png", "pdf"))]
         for one in files:
@@ -298,20 +289,11 @@ def card(
     pairs = zip(records, laws, strict=True)
     targets = [np.where(one.motion > 0.0, law, 0.0) for one, law in pairs]  # cards have no tension
     unloading = loading.fit_unloading(replays, targets, expon=format != "mat057")
-    records = [
-        replace(one, card=replay(unloading)) for one, replay in zip(records, replays, strict=True)
-    ]
+    each = zip(records, replays, strict=True)
+    records = [replace(one, card=replay(unloading)) for one, replay in each]
     densities = [one.density for one in records if one.density is not None]
-    warnings = sentences(
-        "warnings",
-        source=source,
-        format=format,
-        requested=requested,
-        chosen=chosen,
-        crossed=crossed,
-        guessed=loading.guessed(source, curves),
-        density=bool(densities),
-    )
+    told = {"source": source, "format": format, "requested": requested, "chosen": chosen}
+    told |= {"guessed": loading.guessed(source, curves), "density": bool(densities)}
     made = Card(
         name=source.name,
         format=format,
@@ -324,7 +306,7 @@ def card(
             "card": _rms(one.misfit_of_card for one in records),
         },
         density=float(np.mean(densities)) if densities else None,
-        warnings=warnings,
+        warnings=sentences("warnings", crossed=crossed, **told),
         records=tuple(records),
     )
     if out is not None:

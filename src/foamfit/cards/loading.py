@@ -17,18 +17,16 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import least_squares
 from scipy.signal import savgol_filter
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Mask
 from foamfit.data.measurement import Specimen
 from foamfit.errors import InputError, SimulationError
 from foamfit.solve.simulation import Response, simulate
 from foamfit.springs.chain import DisplacementDrive
-from foamfit.study.identified import Source
-from foamfit.study.population import Population
+from foamfit.study.identified import Population, Source
 
 POINTS = 100  # of a curve in a card
 # A curve ends at the strain END, or where its stress exceeds MOST times the largest stress within
@@ -39,19 +37,20 @@ _FINE = 2000  # intervals of the strain from which the points are chosen
 _LEAST_SLOPE = 1e-3  # least slope of a curve over its mean slope within the measured strain
 _SAME = 0.1  # rates that differ by a smaller fraction count as equal
 _CLOSE = 0.01  # smaller differences of stress, over its range, are ignored
+# Bounds and start of HU, SHAPE and EXPON. HU = 0 would switch off the hysteresis.
+_LEAST, _MOST = (1e-3, 0.05, 0.05), (1.0, 50.0, 50.0)
+_START_AT = (0.2, 2.0, 0.9)
+_WINDOW = 0.03  # smoothing window of the strain, as a fraction of the samples of a record
 
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Loading curves: stress (n_rates, n) in Pa over strain (n,) at strain rates (1/s), ascending.
+    """Loading curves over the strain, one for each strain rate."""
 
-    Beyond the strain `measured_to` they are extrapolated by the law.
-    """
-
-    rates: Array
-    strain: Array
-    stress: Array
-    measured_to: float
+    rates: Array  #: 1/s, ascending
+    strain: Array  #: (n,)
+    stress: Array  #: (n_rates, n), Pa
+    measured_to: float  #: strain beyond which they are extrapolated by the law
 
     @cached_property
     def work(self) -> Array:
@@ -76,11 +75,9 @@ class Curves:
 def follow(
     source: Source, rate: float | None, strain: Array, time: Array, names: Sequence[str] = ()
 ) -> Response:
-    """Simulate the law along a strain (over time in s), its parameters being those at `rate` (1/s).
+    """Simulate the law along a strain (over time in s) at `rate` (1/s), with slopes by `names`.
 
-    The response contains the derivatives with respect to the parameters `names`. Raises InputError
-    if the common values of a joint result are not admissible together, SimulationError if the
-    simulation fails.
+    Raises InputError if the common values of a joint result are not admissible together.
     """
     heights = [one.value for name, one in source.parameters.items() if name.endswith("_height")]
     height = sum(heights) or 1.0  # a single spring of any height has the same stress
@@ -129,15 +126,12 @@ def curves_at(source: Source, rates: Sequence[float], measured_to: float) -> tup
 
 
 def _reached(source: Source, rates: Sequence[float], measured_to: float) -> tuple[Array, Array]:
-    """Return strains up to the largest that the law reaches, and its stress there at each rate.
-
-    A bistable spring with a negative eps_star ends at a strain below one.
-    """
+    """Return strains up to the largest that the law reaches, and its stress there at each rate."""
     for end in np.linspace(max(END, measured_to), measured_to, _ENDS).tolist():
         fine = np.linspace(0.0, end, _FINE + 1)
         try:
             return fine, np.array([follow(source, r, fine, fine / r).base_stress for r in rates])
-        except SimulationError as error:
+        except SimulationError as error:  # a negative eps_star ends a spring below a strain of one
             ended = error
     raise ended
 
@@ -150,12 +144,6 @@ def guessed(source: Source, curves: Curves) -> list[str]:
     changes = {name: slopes[name].base_stress * source.parameters[name].value for name in open_}
     least = _CLOSE * curves.stress.max()
     return [name for name in open_ if np.abs(changes[name]).max() > least]
-
-
-# Bounds and start of HU, SHAPE and EXPON. HU = 0 would switch off the hysteresis.
-_LEAST, _MOST = (1e-3, 0.05, 0.05), (1.0, 50.0, 50.0)
-_START_AT = (0.2, 2.0, 0.9)
-_WINDOW = 0.03  # smoothing window of the strain, as a fraction of the samples of a record
 
 
 class Unloading(NamedTuple):
@@ -176,20 +164,17 @@ Replay = Callable[[Unloading], Array]
 
 
 class Motion(NamedTuple):
-    """Strain of a record, its rate (1/s), and whether it is the largest so far (first loading).
-
-    Rate and `first` use the smoothed strain, so that noise neither loads nor unloads.
-    """
+    """Strain of a record, its rate (1/s), and whether it is the largest so far (first loading)."""
 
     strain: Array
     rate: Array
-    first: NDArray[np.bool_]
+    first: Mask
 
     @classmethod
     def of(cls, strain: Array, time: Array) -> Motion:
         """Return the motion of a record in compression; the time is in s."""
         strain = np.maximum(strain, 0.0)
-        window = max(3, int(_WINDOW * strain.size)) | 1
+        window = max(3, int(_WINDOW * strain.size)) | 1  # so that noise neither loads nor unloads
         smooth = savgol_filter(strain, window, 1) if strain.size > window else strain
         return cls(strain, np.gradient(smooth, time), smooth >= np.maximum.accumulate(smooth))
 
@@ -204,12 +189,10 @@ def by_energy(curves: Curves, motion: Motion) -> Replay:
 
 
 def by_slowest(curves: Curves, motion: Motion) -> Replay:
-    """Radioss LAW90: unloading scales the slowest curve, any loading follows the loading curves.
-
-    The energy is integrated along the path.
-    """
+    """Radioss LAW90: unloading scales the slowest curve, any loading follows the loading curves."""
     back = (motion.rate < 0.0) & ~motion.first
     load = curves.at(curves.stress, motion.strain, np.where(back, 0.0, motion.rate))
+    # The energy is integrated along the path.
     work: Array = np.maximum(cumulative_trapezoid(load, motion.strain, initial=0), 0.0)
     energy = np.where(back, _ratio(work, np.maximum.accumulate(work)), 1.0)
     return lambda unloading: unloading.share(energy) * load
@@ -237,11 +220,9 @@ def _ratio(work: Array, most: Array) -> Array:
 
 
 def unloading_curve(curves: Curves, unloading: Unloading) -> Array:
-    """Return the stress (Pa) of unloading from the largest measured strain at the lowest rate.
-
-    Beyond this strain it stays just below the loading curve, which it must not meet.
-    """
+    """Return the stress (Pa) of unloading from the largest measured strain at the lowest rate."""
     most = np.interp(curves.measured_to, curves.strain, curves.work[0])
+    # Beyond this strain it stays just below the loading curve, which it must not meet.
     share = np.minimum(unloading.share(curves.work[0] / most), 0.999)
     return np.asarray(share * curves.stress[0])
 
@@ -249,10 +230,7 @@ def unloading_curve(curves: Curves, unloading: Unloading) -> Array:
 def fit_unloading(
     replays: Sequence[Replay], targets: Sequence[Array], *, expon: bool = True
 ) -> Unloading:
-    """Fit the unloading to stresses (Pa) along records; without `expon` the exponent is 1.
-
-    The cost is the mean square of the residuals over the range, summed over the records.
-    """
+    """Fit the unloading to stresses (Pa) relative to their ranges; without `expon`, EXPON is 1."""
     free = slice(None) if expon else slice(2)
     weights = [1.0 / (np.ptp(target) * np.sqrt(target.size)) for target in targets]
 

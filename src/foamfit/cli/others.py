@@ -29,7 +29,7 @@ def check(test: Path, specimen: Path | None) -> None:
     """
     from foamfit.data.csv_file import read_test
     from foamfit.data.energy import audit
-    from foamfit.report.described import describe
+    from foamfit.report.summary import describe
 
     measurement = read_test(test, specimen)
     if measurement.priors:

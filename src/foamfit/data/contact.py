@@ -203,6 +203,8 @@ def first_contact(record: Record) -> Record:
     share = (stress - free) / max(float(stress.max()) - free, 1e-300)
     edges = np.flatnonzero(np.diff(np.concatenate(([False], share > _AGAIN, [False]))))
     begins, ends = edges[::2], edges[1::2]
+    if not begins.size:
+        return record
     flights = begins[1:] - ends[:-1] > 2 * (ends - begins).max()
     impulses = np.add.reduceat(share.clip(0.0), begins)
     for i in np.flatnonzero(flights):
@@ -331,7 +333,7 @@ def rise_of(
         sigma, tau = scatter
     size = float(up[-1]) - base
     # A soft start may be hidden by noise in single samples; any length of rest may precede it.
-    width = 1 + (up.size - rest) // _WINDOWS
+    width = 1 + max(up.size - rest, 0) // _WINDOWS
     clear = _CLEAR * sigma * np.sqrt(min(tau / width, 1.0))
     level = min(max(_RISE_SHARE * size, clear), _LARGEST * size)
     part = _first_rise(smooth(up, width) - base, level)

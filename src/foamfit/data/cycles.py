@@ -371,4 +371,4 @@ def _velocity(time: Array, motion: Array, sigma: float) -> float | None:
     top = top if when > _HELD * top else when
     rest = np.flatnonzero(motion[:near] <= depth)  # rows of a rest before contact do not load
     low = int(rest[-1]) + 1 if depth > 0.0 and rest.size else 0
-    return float((most - motion[low]) / (top - time[low]))
+    return float((most - motion[low]) / (top - time[low])) if top > time[low] else None

@@ -49,6 +49,8 @@ _USUAL = {
     "modulus (peak stress over peak strain)": (10.0, 1e11, "Pa"),
     "duration": (1e-6, 1e7, "s"),
 }
+_AT_START = 0.05  # share of the peak that a stress may have at the start
+_ROUNDING = 1e-12  # share of its values by which a constant channel may vary
 _WHOLE, _UNKNOWN = Window(), Noise()  # the whole file; no noise is stated
 
 
@@ -69,6 +71,7 @@ def condition(
         raise InputError("[window] cycle is for slow tests; for an impact give start and end.")
     record = repair.cut_strays(cut_to_window(record, window))
     record = repair.mark_clipped(repair.bridge_outliers(record))
+    _check_varying(record)
     still = [] if impact else repair.find_standstills(record)
     record, held = repair.fill_staircase(record)
     record = repair.bridge_standstills(record, still, specimen.height)
@@ -230,6 +233,14 @@ def cut_to_window(record: Record, window: Window) -> Record:
     return record
 
 
+def _check_varying(record: Record) -> None:
+    """Raise InputError for a channel that varies only at its ends, in spikes or by rounding."""
+    for name, values in record.curves().items():
+        inner = values[1:-1]
+        if np.ptp(inner) <= _ROUNDING * np.abs(inner).max():
+            raise InputError(f"the {name} is constant but for single rows; it must vary.")
+
+
 def integrate_motion(record: Record, specimen: Specimen, striker: Striker) -> Record:
     """Integrate a missing displacement: w(0) = 0, w'(0) = v, and w'' = g − a or g − σA/m.
 
@@ -337,6 +348,11 @@ def checks(record: Record, specimen: Specimen, *, several: bool) -> Record:
     peak = float(record.stress.max())
     if peak <= 0.0:
         raise _never_positive(record.stress)
+    for name, values in record.curves().items():
+        measured = values[record.sampled.get(name, slice(None))]
+        if not measured.size or np.ptp(measured) == 0:
+            wrong = f"the {name} does not vary in the part that is used"
+            raise InputError(f"{wrong}; correct its column, or choose another part by [window].")
     duration = 1.0 if record.time is None else float(np.ptp(record.time))
     sizes = height, specimen.area, strain, peak, peak / strain if strain > 0 else 1e3, duration
     for value, (name, (low, high, unit)) in zip(sizes, _USUAL.items(), strict=True):
@@ -352,10 +368,12 @@ def checks(record: Record, specimen: Specimen, *, several: bool) -> Record:
         if largest > 1.05 * displacement.max():
             notes.append(f"Check: {name} goes farther than the top; check its unit and its node.")
     stress = record.stress  # a fast ramp may load the second row
-    first = min(stress[:3].mean(), stress[0] + 3.0 * noise_level(stress))
-    if first > 0.05 * peak:
-        load = percent(first / peak)
-        notes.append(f"Check: {zeros.UNDER_LOAD}, at {load} of the peak stress.")
+    noise, first = 3.0 * noise_level(stress), float(stress[:3].mean())
+    if (load := min(first, float(stress[0]) + noise)) > _AT_START * peak:
+        notes.append(f"Check: {zeros.UNDER_LOAD}, at {percent(load / peak)} of the peak stress.")
+    if first + noise < -_AT_START * peak:
+        wrong = f"the stress starts below zero, at {engineering(first, 'Pa')}"
+        notes.append(f"Check: {wrong}; if that is no tension, correct its zero in the file.")
     lowest, width = lowest_mean(stress, int(np.argmax(stress)))
     if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
         after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"

@@ -78,6 +78,8 @@ def tail_level(values: Array, noise: NoiseLevel) -> Level | None:
     standard error of one row.
     """
     size = max(8, int(_TAIL * len(values)))
+    if len(values) < size:
+        return None
     step, n = max(4, size // 2), size
     level, rows = mean_level(values[-n:], noise), np.arange(n, dtype=np.float64)
     slope = polynomial_at(rows, values[-n:], 0.0, noise)[1]

@@ -81,6 +81,9 @@ def make_params(
     if measurement.time is None and wanting:
         end = "; give one, or leave relaxation out" if model.relaxation else ""
         raise InputError(f"{measurement.name}: {wanting[0]} needs a time column{end}")
+    if (motion := measurement.displacement) is not None and motion.max() <= motion[0]:
+        wrong = f"{measurement.name}: the displacement does not rise in the part that is used"
+        raise InputError(f"{wrong}; choose a part with a loading by [window]")
     params, count = lmfit.Parameters(), len(model.kinds)
     fast = drive == "impact"
     on_striker = fast and (count > 1 or balance(measurement).damping is not None)
@@ -94,6 +97,11 @@ def make_params(
         value = param.start[0] * scales.unit(param.start[1])
         low, high = (bound * scales.unit(param.scale) for bound in param.bounds)
         low *= scales.least(param)
+        if _alike(low, high):
+            wrong = (
+                f"{measurement.name}: {name} cannot be searched between {low:.2g} and {high:.2g}"
+            )
+            raise InputError(f"{wrong} (SI); check the units of the test")
         vary = short != "eta" or (on_striker if spring < 0 else fast and count == 1)
         params.add(name, value=value, min=low, max=high, vary=vary)
     _add_heights(params, measurement, model)
@@ -188,9 +196,15 @@ def _add_nuisance(
     for name in nuisance.names_of(drive, time_shift=late):
         low, high = nuisance.limits_of(name, measurement, drive, scales.duration, late=late)
         origin = measurement.origins.get(name, 0.0)
-        open_ = low < high and (name != nuisance.FORCE_SCALE or shows_force)
-        limits = {"min": low + origin, "max": high + origin} if open_ else {}
+        low, high = low + origin, high + origin
+        open_ = not _alike(low, high) and (name != nuisance.FORCE_SCALE or shows_force)
+        limits = {"min": low, "max": high} if open_ else {}
         params.add(name, value=usual[name] + origin, vary=name in free and open_, **limits)
+
+
+def _alike(low: float, high: float) -> bool:
+    """Return whether lmfit takes two limits for equal."""
+    return high <= low or bool(np.isclose(low, high, rtol=1e-13, atol=1e-13))
 
 
 def _counted_from(

@@ -25,7 +25,7 @@ from foamfit.page.worker import FirstUse, News, parsed
 from foamfit.parts import law_in_words
 from foamfit.report.folder import load_result
 from foamfit.springs.model import Model
-from foamfit.study.saved import load
+from foamfit.study.identified import load
 
 EXAMPLE = Path(__file__).with_name("example") / "foam.csv"
 # Shared by all windows: one test is read, and one set of curves prepared, at a time.

@@ -28,9 +28,9 @@ from foamfit.data.toml_file import LONGEST, toml_beside
 from foamfit.errors import InputError
 from foamfit.page.worker import Job, Worker, parsed
 from foamfit.report import figures
-from foamfit.report.described import describe
 from foamfit.report.panels import Line, Panel
 from foamfit.report.plots import panelled
+from foamfit.report.summary import describe
 from foamfit.study.study_file import ENDINGS
 from foamfit.text import listed
 

@@ -24,9 +24,8 @@ from foamfit.parts import ParameterEstimate, law_in_words
 from foamfit.report import figures
 from foamfit.report.figures import TWO
 from foamfit.report.folder import load_result
-from foamfit.report.readable import readable
-from foamfit.report.render import sentences, words
-from foamfit.report.studies.parameters import Panel, plot_parameters
+from foamfit.report.plots import Values, plot_parameters
+from foamfit.report.render import readable, sentences, words
 from foamfit.results import Fit
 from foamfit.springs.laws import law
 from foamfit.springs.laws.record import COMMON, ETA, HEIGHT, RELAXATION_TIME, STRENGTH, Compared
@@ -48,17 +47,13 @@ VAGUE = "its standard error is many times its value, so the test does not determ
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity and its reference, in the paper's unit ("s2 k_h+/k0", "" or "k0", "MPa").
-
-    The state of a ratio is the worst of its parts. A published `reference` has no standard error.
-    `remark` is the reason why the two are not compared, or "".
-    """
+    """One quantity and its reference, in the paper's unit ("s2 k_h+/k0", "" or "k0", "MPa")."""
 
     label: str
     unit: str
-    fitted: ParameterEstimate
-    reference: ParameterEstimate | None
-    remark: str
+    fitted: ParameterEstimate  # the state of a ratio is the worst of its parts
+    reference: ParameterEstimate | None  # a published one has no standard error
+    remark: str  # why the two are not compared, or ""
 
     @property
     def lost(self) -> bool:
@@ -263,15 +258,11 @@ def _row(
     label: str,
     one: Compared,
     names: tuple[list[str], list[str]],
-    about: tuple[Side, Side, str],
+    about: tuple[Side, Side, str],  # both sides, and why nothing is compared
     *,
     eta: bool,
 ) -> Iterator[Row]:
-    """Yield the row of a function of the parameters `names` of both sides.
-
-    `about` are both sides and why nothing is compared, or "". A dashpot of zero that no other value
-    stands beside has no row.
-    """
+    """Yield the row of a function of parameters; a dashpot of zero beside no value has none."""
     side, other, nothing = about
     value, reference = (s.evaluate(n, one.formula) for s, n in zip(about[:2], names, strict=True))
     always = not eta or (other.source is not None and one is DAMPING)
@@ -337,11 +328,7 @@ def _with_error(p: ParameterEstimate | None) -> str:
 def plot_comparison(
     comparison: Comparison, path: str | Path | None = None, *, width: str = TWO
 ) -> Figure:
-    """Draw fitted values with 95 % intervals, one row per result, and the references as ticks.
-
-    Quantities that are neither compared nor lost (`Row.lost`) are omitted. For `path` and `width`
-    see `plots.plot_response`.
-    """
+    """Draw fitted values with 95 % intervals and references as ticks; see `plots.plot_response`."""
     sources = [pair.other.source for pair in comparison.pairs]
     tests = [
         f"{pair.side.given['test'] if source is None else source.name}, {pair.side.given['drive']}"
@@ -349,11 +336,12 @@ def plot_comparison(
     ]
     if len(set(tests)) < len(tests):
         tests = [f"{i}: {name}" for i, name in enumerate(tests, start=1)]
-    panels = dict[str, Panel]()
+    panels = dict[str, Values]()
     for test, pair in zip(tests, comparison.pairs, strict=True):
         for row in pair.rows:
+            # What is neither compared nor lost is omitted.
             if row.reference and (row.standard_errors is not None or row.lost):
-                one = panels.setdefault(row.label, Panel(row.label, _math(row.label), {}, {}))
+                one = panels.setdefault(row.label, Values(row.label, _math(row.label), {}, {}))
                 one.tests[test] = _drawn(row.fitted, row.unit, row.fitted.state)
                 one.references[test] = _drawn(row.reference, row.unit, comparison.reference)
     title = f"fitted and {comparison.reference} parameters"

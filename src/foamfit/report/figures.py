@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 Format = Literal["png", "pdf", "svg"]
 
 GREY, BLUE, VERMILION = "#6b6b6b", "#0072B2", "#D55E00"  # palette of Okabe and Ito
@@ -44,9 +43,8 @@ STYLE: Any = {  # matplotlib types its keys one by one
     "svg.hashsalt": "foamfit",  # the same figure gives the same file
 }
 DPI = 250  # of a PNG
-# Width of one and two columns of the Journal of Applied Mechanics, inches.
 TWO = "two"
-COLUMNS = {"one": 3.25, TWO: 7.0}
+COLUMNS = {"one": 3.25, TWO: 7.0}  # widths in the Journal of Applied Mechanics, inches
 NARROWEST, WIDEST = 2.5, 20.0
 UNTITLED = "untitled"  # option after a width and a comma
 LINE = 11.0 / 72.0  # height of a line of a title or a legend, inches
@@ -117,10 +115,7 @@ def axes_or_new(ax: Axes | None) -> Iterator[Axes]:
 
 
 def legend_below(figure: Figure, axes: Iterable[Axes], first: Iterable[str] = ()) -> None:
-    """Draw a common legend below all panels, which begins with the labels `first`.
-
-    Every line but the first adds to the figure's height.
-    """
+    """Draw a legend below all panels, labels `first` first; lines after one add to the height."""
     each = (zip(*reversed(ax.get_legend_handles_labels()), strict=True) for ax in axes)
     entries = {name: artist for pairs in each for name, artist in pairs}
     entries = {name: entries[name] for name in first if name in entries} | entries
@@ -139,14 +134,12 @@ def legend_below(figure: Figure, axes: Iterable[Axes], first: Iterable[str] = ()
 
 
 def images(figure: Figure, *forms: Format, dpi: int = DPI) -> list[bytes]:
-    """Return the figure as the bytes of a file of each format; `dpi` is that of pixels.
-
-    The layout is found once for all of them, as it takes longer than drawing one.
-    """
+    """Return the figure as the bytes of a file of each format; `dpi` is that of pixels."""
     import matplotlib
 
     with matplotlib.rc_context(STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # in names of tests
+        # The layout is found once for all formats, as it takes longer than drawing one.
         if (engine := figure.get_layout_engine()) is not None:
             engine.execute(figure)
             figure.set_layout_engine(None)
@@ -194,10 +187,7 @@ def figure_format(path: str | Path) -> Format:
 
 
 def write_both(figure: Figure, place: Path) -> bytes:
-    """Write a figure as PNG and PDF into a new folder; return it as SVG.
-
-    `place` is a path without suffix. Raises OSError, which `folder.save_whole` explains.
-    """
+    """Write `place`.png and .pdf and return SVG; OSError is explained by `folder.save_whole`."""
     png, pdf, svg = images(figure, "png", "pdf", "svg")
     place.with_suffix(".png").write_bytes(png)
     place.with_suffix(".pdf").write_bytes(pdf)

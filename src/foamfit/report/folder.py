@@ -22,9 +22,8 @@ from foamfit.errors import InputError
 from foamfit.files import csv_bytes, is_left, read_whole, reason, replacing
 from foamfit.report.figures import TWO, inches, write_both
 from foamfit.report.plots import figures_of
-from foamfit.report.readable import Readable
+from foamfit.report.render import Readable, numbers_of, parameters_tex, with_head
 from foamfit.report.summary import render_report
-from foamfit.report.tables import numbers_of, parameters_tex, with_head
 from foamfit.results import SCHEMA, Fit
 from foamfit.text import counted, wrapped
 
@@ -113,9 +112,8 @@ def save_whole(folder: str | Path, write: Callable[[Path], None]) -> Path:
             write(fresh)
             check_target(folder)  # keep files that were added in the meantime
     except OSError as error:
-        raise InputError(
-            f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
-        ) from error
+        why = f"the result cannot be written to {folder}: {reason(error)}; choose another folder"
+        raise InputError(why) from error
     return folder
 
 
@@ -174,16 +172,12 @@ def check_target(folder: str | Path, *, of: str | None = None, kept: bool = Fals
             if path.exists() and not os.access(path, os.W_OK | os.X_OK):
                 raise PermissionError(0, f"Permission denied in {path}")
     except (OSError, RuntimeError) as error:  # RuntimeError: a link to itself
-        raise InputError(
-            f"{folder} cannot be written: {reason(error)}; choose another folder"
-        ) from error
+        why = f"{folder} cannot be written: {reason(error)}; choose another folder"
+        raise InputError(why) from error
 
 
 def check_same(folder: str | Path, data_sha256: str, options: Mapping[str, Any]) -> None:
-    """Raise InputError if `folder` has a result of other data, or made with other options.
-
-    `options` are those of the new result; see `foamfit.results.Fit.options`.
-    """
+    """Raise InputError if `folder` has a result of other data or other options (`Fit.options`)."""
     place = Path(folder).resolve()
     contents = ((name, _content(place / name)) for name in FILES)
     name, content = next(((name, one) for name, one in contents if one), ("", {}))
@@ -267,18 +261,14 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def load_result(folder: str | Path) -> dict[str, Any]:
-    """Return the content of ``fit.json``, given its path or its folder; values are in SI.
-
-    Raises InputError if this version of foamfit cannot read a result there.
-    """
+    """Return the content of ``fit.json`` (SI), by path or folder; InputError if unreadable."""
     path = Path(folder)
     if path.is_dir():
         inside = sorted(str(one.parent) for one in path.glob("*/fit.json"))
         path = path / "fit.json"
         if inside and not path.is_file():
-            raise InputError(
-                f"{folder} contains {counted(len(inside), 'fit')}; name one, like {inside[0]}"
-            )
+            why = f"{folder} contains {counted(len(inside), 'fit')}; name one, like {inside[0]}"
+            raise InputError(why)
     try:
         content = json.loads(read_whole(path))
     except OSError as error:
@@ -291,18 +281,13 @@ def load_result(folder: str | Path) -> dict[str, Any]:
     if not isinstance(content, dict) or "schema" not in content:
         raise InputError(f"{path} is not the result of a fit (it has no schema number)")
     if content["schema"] != SCHEMA:
-        raise InputError(
-            f"{path} has schema {content['schema']}, but this version of foamfit reads {SCHEMA}"
-        )
+        why = f"{path} has schema {content['schema']}, but this version of foamfit reads {SCHEMA}"
+        raise InputError(why)
     return content
 
 
 def write_result(result: Fit, folder: Path, *, pages: bool = True, width: str = TWO) -> None:
-    """Write all files of a result into an existing folder; report and figures only with `pages`.
-
-    ``profiles.csv`` is written if there are profiles, ``budget.csv`` if the budget contains more
-    than the parameters.
-    """
+    """Write all files of a result into an existing folder; report and figures only with `pages`."""
     write_json(folder / "fit.json", result.to_json_dict())
     texts = ("unit", "state", "why", "ci95_method")
     parameters = (
@@ -326,13 +311,10 @@ def write_result(result: Fit, folder: Path, *, pages: bool = True, width: str = 
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write an object as JSON; a non-UTF-8 name keeps its bytes as a JSON escape.
-
-    The value of "load", which is not meant for readers, is one line at the end.
-    """
+    """Write an object as JSON; a non-UTF-8 name keeps its bytes as a JSON escape."""
     form: Any = {"ensure_ascii": False, "allow_nan": False}
     text = json.dumps({k: v for k, v in content.items() if k != "load"}, indent=2, **form)
-    if "load" in content:
+    if "load" in content:  # one line at the end, as it is not meant for readers
         text = f'{text[:-2]},\n  "load": {json.dumps(content["load"], **form)}\n}}'
     path.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import re
-import sys
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -19,42 +18,43 @@ from foamfit.codec import build, plain
 from foamfit.errors import InputError
 from foamfit.files import csv_bytes, read_whole, write_file
 from foamfit.parts import ParameterEstimate
-from foamfit.report import figures, tables
-from foamfit.report.figures import tail
+from foamfit.report import figures, render
 from foamfit.report.folder import load_result
-from foamfit.report.render import page, words
-from foamfit.report.studies.parameters import panels_of, plot_parameters
+from foamfit.report.plots import plot_parameters, values_of
 from foamfit.report.summary import CURVES
 from foamfit.results import Fit
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import aligned, counted, listed, option_value, percent
+from foamfit.text import counted, listed, option_value
 
 if TYPE_CHECKING:
     import pandas as pd
 
-
 PAGE, MARK = "index.html", b'<meta name="generator" content="foamfit list">'
-LONGEST = 36  # characters of the name of a test in the terminal
 POINTS = 60  # of each curve of a small loop
 WIDE, TALL = 88, 56  # of a small loop, pixels
-HEAD = ["test", "model", "status", "options", "misfit", "determined", "when", "folder"]
 STRAIN, STRESS = "measured displacement (m)", "measured stress (Pa)"
 FITTED = "stress along measured displacement (Pa)"
+REFUSED, OPEN = "refused", "not fitted"  # status of a test without a result
+_STATUS = {
+    "ok": "fitted",
+    "warnings": "fitted with warnings",
+    "failed": "without an acceptable fit",
+    REFUSED: "refused",
+    OPEN: "not fitted yet",
+}
+_MOST_REFUSALS = 20  # named on the terminal
 
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a table of fits: a result, or a test of a batch or a joint fit.
-
-    Without a result, `error` says why. `misfit` has the names of fit.json.
-    """
+    """A line of a table of fits: a result, or a test of a batch or a joint fit."""
 
     test: str
     file: str = ""
     status: str = ""
-    error: str | None = None
-    misfit: Mapping[str, float | None] = field(default_factory=dict)
+    error: str | None = None  #: why there is no result
+    misfit: Mapping[str, float | None] = field(default_factory=dict)  #: by the names of fit.json
     runtime_s: float | None = None
     parameters: Mapping[str, ParameterEstimate] = field(default_factory=dict)
     model: str = ""
@@ -82,34 +82,21 @@ class Row:
     @property
     def counts(self) -> tuple[int, int]:
         """How many parameters of the springs are determined, and how many have a state."""
-        return tables.count_determined(self.parameters)
+        return render.count_determined(self.parameters)
 
     @property
     def date(self) -> str:
         """The local time at which it was written."""
         return time.strftime("%Y-%m-%d %H:%M", time.localtime(self.when))
 
-    @property
-    def cells(self) -> list[str]:
-        """The line in the terminal; of the misfits the largest."""
-        known = [misfit for misfit in self.misfit.values() if misfit is not None]
-        found, varied = self.counts
-        cells = [percent(max(known)) if known else "–", f"{found} of {varied}"]
-        rest = [self.error, "", ""] if self.error else [self.options, *cells]
-        return [tail(self.test, LONGEST), self.model, self.status, *rest, self.date]
-
 
 def lines(results: Sequence[Row], top: Path) -> str:
     """Return a line for each result in the folder `top`, below a head."""
-    rows = [HEAD, *([*one.cells, str(one.place.relative_to(top))] for one in results)]
-    return "\n".join(aligned(rows, most=sys.maxsize))
+    return render.words("list", results=results, top=top)
 
 
 def results_in(folder: str | Path) -> list[Row]:
-    """Return the results of fits and joint fits in a folder and below, by place.
-
-    Raises InputError if the folder contains no result.
-    """
+    """Return the fits and joint fits in a folder and below, by place; InputError without any."""
     if not (top := Path(folder)).is_dir():
         raise InputError(f"{folder} is not a folder; foamfit fit TEST.csv writes results to fits/")
     joints = {*top.rglob("joint.json")}
@@ -173,30 +160,19 @@ def small_loop(path: Path) -> tuple[str, ...]:
 
 
 def table_of(results: Sequence[Row], top: Path) -> dict[str, Any]:
-    """Return the values of table.html for results in the folder `top`.
-
-    The place of a result that has none is the name of its test. Parameters are shown if all fits
-    have the same model.
-    """
-    results = [
-        replace(one, place=one.place if one.place.name else top / one.test) for one in results
-    ]
+    """Return the values of table.html for results in `top`, with parameters if models are alike."""
+    results = [one if one.place.name else replace(one, place=top / one.test) for one in results]
     alike = len({one.model for one in results if not one.error}) <= 1
-    parameters = tables.varied([one.parameters for one in results if alike])
-    found = tables.by_test([one.place.relative_to(top).as_posix() for one in results], parameters)
+    parameters = render.varied([one.parameters for one in results if alike])
+    found = render.by_test([one.place.relative_to(top).as_posix() for one in results], parameters)
     loops = [small_loop(one.place / "curves.csv") for one in results]
     misfits = {name for one in results for name, x in one.misfit.items() if x is not None}
     return {
         "rows": list(zip(results, loops, ((at, p) for at, *p in found["rows"]), strict=True)),
         "heads": found["heads"],
-        "misfits": {curve: name for curve, name in tables.MISFITS.items() if curve in misfits},
+        "misfits": {curve: name for curve, name in render.MISFITS.items() if curve in misfits},
         "more": list(dict.fromkeys(name for one in results for name in one.more)),
         "models": not alike,
-        "options": any(one.options for one in results),
-        "states": any(one.status for one in results),
-        "counted": any(one.status and one.counts[1] for one in results),
-        "timed": any(one.runtime_s is not None for one in results),
-        "dated": any(one.when is not None for one in results),
         "size": (WIDE, TALL),
     }
 
@@ -204,7 +180,7 @@ def table_of(results: Sequence[Row], top: Path) -> dict[str, Any]:
 def index_page(results: Sequence[Row], top: Path, title: str, counts: str, **more: Any) -> bytes:
     """Return the page of a table of fits; `more` may have a picture and a CSV."""
     given = {"picture": None, "csv": "", "mark": MARK.decode()} | more
-    text = page("index", title=title, counts=counts, table=table_of(results, top), **given)
+    text = render.page("index", title=title, counts=counts, table=table_of(results, top), **given)
     return text.encode("utf-8", errors="replace")
 
 
@@ -225,18 +201,6 @@ def write_index(folder: str | Path, results: Sequence[Row]) -> Path | None:
     return path
 
 
-# Status of a test without a result.
-REFUSED, OPEN = "refused", "not fitted"
-_STATUS = {
-    "ok": "fitted",
-    "warnings": "fitted with warnings",
-    "failed": "without an acceptable fit",
-    REFUSED: "refused",
-    OPEN: "not fitted yet",
-}
-_MOST_REFUSALS = 20  # named on the terminal
-
-
 def row_of(test: str, file: str, result: Fit) -> Row:
     """Return the row of a fit."""
     error = None
@@ -254,7 +218,7 @@ def table_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
         {name: getattr(row, name) for name in ("test", "file", "status", "error")}
         | {f"misfit_{name}": row.misfit.get(name) for name in CURVES}
         | {"runtime_s": row.runtime_s, **parameters}
-        for row, parameters in zip(rows, tables.wide([row.parameters for row in rows]), strict=True)
+        for row, parameters in zip(rows, render.wide([row.parameters for row in rows]), strict=True)
     ]
 
 
@@ -275,7 +239,7 @@ def read_table(path: Path) -> pd.DataFrame:
 
 def write_summary(rows: Sequence[Row], folder: Path) -> None:
     """Write summary.csv."""
-    write_file(folder / "summary.csv", csv_bytes(tables.with_head(table_rows(rows))))
+    write_file(folder / "summary.csv", csv_bytes(render.with_head(table_rows(rows))))
 
 
 def counts_in_words(rows: Sequence[Row]) -> str:
@@ -288,24 +252,21 @@ def counts_in_words(rows: Sequence[Row]) -> str:
     return f"{total}: {listed(parts)}" if parts else "no test"
 
 
-def _of_springs(rows: Sequence[Row]) -> tables.ByTest:
+def _of_springs(rows: Sequence[Row]) -> render.ByTest:
     """Return the varied parameters of the springs; a median of contact times has no meaning."""
-    every = tables.varied([row.parameters for row in rows])
+    every = render.varied([row.parameters for row in rows])
     return {name: each for name, each in every.items() if name not in NUISANCE}
 
 
 def summary_words(rows: Sequence[Row]) -> str:
-    """Return the text that the command prints for a batch.
-
-    Its table contains median and quartiles over the tests for each varied parameter.
-    """
+    """Return the text that the command prints for a batch, with quartiles of the parameters."""
     wrong, parameters = [row for row in rows if not row.has_fit], list[Any]()
     for name, each in _of_springs([row for row in rows if row.has_fit]).items():
         present = [p for p in each if p is not None]
-        factor, unit = tables.unit_of_all(present)
+        factor, unit = render.unit_of_all(present)
         quartiles = np.quantile([p.value / factor for p in present], [0.5, 0.25, 0.75]).tolist()
         parameters.append((name, quartiles, unit, [p.state for p in present]))
-    return words(
+    return render.words(
         "batch",
         counts=counts_in_words(rows),
         wrong=wrong[:_MOST_REFUSALS],
@@ -317,21 +278,16 @@ def summary_words(rows: Sequence[Row]) -> str:
 def write_comparison(
     rows: Sequence[Row], folder: Path, title: str, *, width: str, pictures: bool
 ) -> bytes | None:
-    """Write the parameters of all tests as summary.tex and, with `pictures`, as figures.
-
-    Return the figure as SVG, if there is one.
-    """
+    """Write the parameters as summary.tex and, with `pictures`, as figures; return that as SVG."""
     fitted = [row for row in rows if row.has_fit]
     tests = [row.test for row in fitted]
     found = _of_springs(fitted)
-    write_file(
-        folder / "summary.tex", tables.by_test_tex("Test", tests, found).encode("utf-8", "replace")
-    )
+    tex = render.by_test_tex("Test", tests, found)
+    write_file(folder / "summary.tex", tex.encode("utf-8", "replace"))
     if not (pictures and found):
         return None
-    figure = plot_parameters(
-        f"{title} · {counts_in_words(rows)}", tests, panels_of(tests, found), width=width
-    )
+    title += f" · {counts_in_words(rows)}"
+    figure = plot_parameters(title, tests, values_of(tests, found), width=width)
     png, pdf, svg = figures.images(figure, "png", "pdf", "svg")
     write_file(folder / "summary.png", png)
     write_file(folder / "summary.pdf", pdf)

@@ -18,7 +18,6 @@ from foamfit.text import readable_unit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-
 MARKERS = 60  # markers on a measured curve; more would merge
 MANY = 5000  # samples beyond which a curve is stored as pixels, because its outline is too large
 PALE = "#A6CEE3"
@@ -26,12 +25,17 @@ PALE = "#A6CEE3"
 DASHES: Any = ((0, (5, 1.2)), (0, (2.5, 1.2)), (0, (1, 1)), (0, (5, 1.2, 1, 1.2)))
 MARKS = ("^", "v", "D", "p")
 
-
 AXES = {  # name and SI unit of x and y in each panel
     "stress-time": (("time", "s"), ("stress", "Pa")),
     "displacement-time": (("time", "s"), ("displacement", "m")),
     "stress-strain": (("strain", "–"), ("stress", "Pa")),
 }
+# Points at which a spring changes between two branches, in either order.
+POINTS = {"ad": "A1", "da": "A1", "dc": "C1", "ce": "C2", "ec": "C2", "ea": "A2"}
+# Offsets of a name from its point, in typographic points: preferred ones first, then further away.
+SIDES = ((-5.0, 4.0), (5.0, -4.0), (5.0, 4.0), (-5.0, -4.0))
+FARTHER = (1.0, 2.5, 4.0)
+LIGHT = {"a": 0.9, "c": 0.5}  # place of the name along an elastic branch, over its length
 
 
 @dataclass(frozen=True)
@@ -49,16 +53,13 @@ class Line:
 
 @dataclass(frozen=True)
 class Panel:
-    """Curves in common axes, with name and SI unit of x and of y.
-
-    `below` are curves in a strip below the panel, in % of the measured range: residuals or others.
-    """
+    """Curves in common axes, with name and SI unit of x and of y."""
 
     name: str  # "stress-strain", …
     x: tuple[str, str]
     y: tuple[str, str]
     lines: list[Line]
-    below: list[Line] = field(default_factory=list)
+    below: list[Line] = field(default_factory=list)  # in a strip, in % of the measured range
     below_name: str = "residual"
     title: str = ""
 
@@ -204,14 +205,6 @@ def size(values: Array) -> float:
     return float(np.nanmax(np.abs(values), initial=0.0))
 
 
-# Points at which a spring changes between two branches, in either order.
-POINTS = {"ad": "A1", "da": "A1", "dc": "C1", "ce": "C2", "ec": "C2", "ea": "A2"}
-# Offsets of a name from its point, in typographic points: preferred ones first, then further away.
-SIDES = ((-5.0, 4.0), (5.0, -4.0), (5.0, 4.0), (-5.0, -4.0))
-FARTHER = (1.0, 2.5, 4.0)
-LIGHT = {"a": 0.9, "c": 0.5}  # place of the name along an elastic branch, over its length
-
-
 def annotate(result: Fit, ax: Axes, panel: Panel, size: tuple[float, float]) -> None:
     """Add everything except the curves to a panel of about this size in points."""
     _mark_outliers(ax, panel, result)
@@ -305,10 +298,7 @@ def _place(switch: Switch, result: Fit) -> tuple[float, float, float]:
 
 
 def _points(panel: Panel, result: Fit) -> Iterator[tuple[str, str, float, float]]:
-    """Yield spring, name, x and y of changes of branch and of half-snapped micro-springs.
-
-    They are in the coordinates of the measured curves, whose zeros may have been fitted.
-    """
+    """Yield spring, name, x and y, as measured, of switches and of half-snapped micro-springs."""
     for switch in result.switches:
         ends, x = (switch.source, switch.target), switch.time
         name = POINTS.get("".join(ends))

@@ -1,22 +1,26 @@
-"""Terminal output and HTML report of a fit."""
+"""Terminal output of a test and of a fit, and the HTML report of a fit."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
-from foamfit.data.measurement import interior_channel
+import numpy as np
+
+from foamfit.data.energy import EnergyAudit, largest_motion, noise_sentences
+from foamfit.data.measurement import UNITS, Measurement, Striker, interior_channel
+from foamfit.data.zeros import CONTRADICTED
 from foamfit.fitting.nuisance import POSITIVE
 from foamfit.parts import covered
+from foamfit.report import render
 from foamfit.report.figures import images
 from foamfit.report.plots import origin_word
-from foamfit.report.readable import Readable, readable
-from foamfit.report.render import page, table, words
-from foamfit.report.tables import count_determined
+from foamfit.report.render import Readable, count_determined, readable, words
 from foamfit.results import Fit
 from foamfit.springs.parameters import NUISANCE
-from foamfit.text import aligned, counted, percent, warning, wrapped
+from foamfit.text import aligned, counted, labelled, percent, warning, wrapped
 from foamfit.trust.covariance import RULE
 
 if TYPE_CHECKING:
@@ -27,10 +31,59 @@ CURVES = {
     "displacement_time": "displacement-time",
     "stress_strain": "stress-strain",
 }
+# Effect of 1 % of a quantity in an impact and in a slow test (None: no effect), largest first.
+EFFECTS = {
+    "velocity": ("2 % of the striker's energy and 1 % of its momentum", None),
+    "striker_mass": ("1 % of both", None),
+    "area": ("1 % of every stress", "1 % of every stress and stiffness"),
+    "height": ("1 % of every strain", "1 % of every strain, and so of the stiffnesses"),
+}
 ANSWERS = {True: "yes", False: "no", None: "–"}
 LINES, COLUMNS = 22, 80  # screen of a fit; two more lines state where the result is
 WARNING_LINES = 3  # kept for warnings
 LONGEST = 180  # characters of the reasons for a state; longer ones appear only in the report
+
+
+def describe(test: Measurement, audit: EnergyAudit) -> str:
+    """Describe a test for the terminal."""
+    channels, time = test.channels(), test.time
+    told = any(one.quantity == "velocity" for one in audit.contradictions)
+    peaks = dict[str, tuple[float, float | None]]()
+    for name, values in channels.items():
+        top, size = int(np.argmax(values)), float(values.max())
+        if name != "stress":
+            top, size = largest_motion(values, time)
+        peaks[name] = size, None if time is None else float(time[top])
+    lines = render.sentences(
+        "described",
+        test=test,
+        audit=audit,
+        spreads=defaultdict(float, test.uncertainties),
+        count=max(map(len, channels.values())),
+        step=None if time is None else float(np.median(np.diff(time))),
+        peaks=peaks,
+        units=UNITS,
+        noises=noise_sentences(test),
+        notes=[note for note in test.notes if not (told and CONTRADICTED in note)],
+        remedies=[
+            f"[{where}] {line}" for one in audit.contradictions for where, line in one.lines[:1]
+        ],
+        exact=taken_for_exact(test),
+    )
+    return labelled((label, text) for label, _, text in (line.partition("¦") for line in lines))
+
+
+def taken_for_exact(test: Measurement) -> dict[str, str]:
+    """Return the quantities without a ± in the TOML and the effect of 1 %, largest first."""
+    striker, effects = test.striker or Striker(), dict[str, str]()
+    impact = test.time is not None and striker.mass and striker.velocity
+    for name, (of_impact, of_slow) in EFFECTS.items():
+        effect = of_impact if impact else of_slow
+        if name == "striker_mass" and test.braked:
+            effect = EFFECTS["area"][0]
+        if effect and name not in test.uncertainties:
+            effects[name.replace("_", " ")] = effect
+    return effects
 
 
 def summary_text(result: Fit, *, verbose: bool = False) -> str:
@@ -44,8 +97,6 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
     rows = [readable(name, p) for name, p in result.parameters.items()]
     values: dict[str, Any] = {
         "result": result,
-        "m": result.measurement,
-        "ladder": result.ladder,
         "shown": misfit_words(misfits(result)),
         "fixed": [row for row in rows if row.state == "fixed"],
         "determined": determined(result),
@@ -61,10 +112,7 @@ def summary_text(result: Fit, *, verbose: bool = False) -> str:
 
 
 def _screen(result: Fit, rows: list[Readable], values: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines that fit on one screen, or all lines if they are to be `verbose`.
-
-    Of these, states and rows are listed further below.
-    """
+    """Yield the lines that fit on one screen, or all lines if they are to be `verbose`."""
     verbose = values["verbose"]
     head = words("short", part="head", **values).split("\n")
     head = [line for one in head for line in wrapped(one, 2, COLUMNS)[:2]]
@@ -164,21 +212,18 @@ def tables(result: Fit) -> dict[str, list[list[str]]]:
     """Return the cells of the tables of cycles and of compared models; [] if there are none."""
     cycles, ladder = result.by_cycle, result.ladder
     return {
-        "cycles": table("by_cycle", found=cycles) if cycles else [],
-        "ladder_rows": table("ladder", ladder=ladder) if ladder else [],
+        "cycles": render.table("by_cycle", found=cycles) if cycles else [],
+        "ladder_rows": render.table("ladder", ladder=ladder) if ladder else [],
     }
 
 
 def render_report(result: Fit, drawn: Mapping[str, Figure], fit_svg: bytes | None = None) -> str:
-    """Return the report as a self-contained HTML page.
-
-    `drawn` are the figures of `figures_of`, `fit_svg` is that of the fit as SVG, if known.
-    """
+    """Return the report as a self-contained HTML page; `drawn` are the figures of `figures_of`."""
     svg = {} if fit_svg is None else {"fit": fit_svg}
     svg |= {name: images(one, "svg")[0] for name, one in drawn.items() if name not in svg}
     plain, springs, insight = result.to_json_dict(), result.springs, result.insight
     parts, shares = ((), None) if insight is None else (insight.parts, insight.shares())
-    return page(
+    return render.page(
         "report",
         result=result,
         origin=origin_word(result),

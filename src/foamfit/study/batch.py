@@ -199,11 +199,9 @@ def batch(
         `foamfit.fit_cycles`, and each has a row in the summary.
     cycles : (int, int), optional
         First and last of several cycles that are fitted as one history.
-    report : bool
-        Whether to write a report and figures for each fit.
-    figure_width : str
-        "one" or "two" columns, or a length such as "85 mm". A test whose figures have another
-        width is fitted again, because its curves are not stored.
+    report, figure_width
+        As for `foamfit.FitResult.save`. A test whose figures have another width is fitted again,
+        because its curves are not stored.
     progress : callable, optional
         Called with the `Batch` after each test; its `rows`, `tests`, `wrong` and `fitted` describe
         the progress, and at the end its `summary` the results.
@@ -272,15 +270,11 @@ def _checked(model: str, options: Options) -> str:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How every test of a batch is fitted.
-
-    `cycles` is one number, several, () for all cycles of a record, or None for the cycle that the
-    TOML names; `options` are keywords of `foamfit.fit`.
-    """
+    """How every test of a batch is fitted."""
 
     model: str
-    options: Mapping[str, Any]
-    cycles: int | tuple[int, ...] | None = None
+    options: Mapping[str, Any]  # keywords of `foamfit.fit`
+    cycles: int | tuple[int, ...] | None = None  # (): all; None: the one that the TOML names
     pages: bool = True
     width: str = TWO  # of the figures
     laws: Mapping[str, str] = field(default_factory=laws.texts)  # texts of the user's law files
@@ -299,18 +293,15 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Task:
-    """One test to be fitted; `out` is the folder to write.
-
-    Relative paths count from `where`. `fingerprint` is that of the files as the caller sees them.
-    """
+    """One test to be fitted."""
 
     name: str
     path: Path
     toml: Path
     recipe: Recipe
-    fingerprint: str
-    out: Path
-    where: Path = field(default_factory=Path.cwd)
+    fingerprint: str  # of the files as the caller sees them
+    out: Path  # folder to write
+    where: Path = field(default_factory=Path.cwd)  # from which relative paths count
 
     def refused(self, why: str) -> tuple[Row, ...]:
         """Return the row of a test without a result."""
@@ -331,10 +322,7 @@ def fingerprint(recipe: Recipe, path: Path, toml: Path) -> str:
 
 
 def stored(task: Task) -> tuple[Row, ...] | None:
-    """Return the rows in a test's folder if they have its fingerprint, else None.
-
-    If the recipe includes figures, they must exist and have its width.
-    """
+    """Return the rows in a test's folder if fingerprint and figures are those asked, else None."""
     # There may be no record, or one of another version.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         content = json.loads((task.out / RECORD).read_text(encoding="utf-8"))
@@ -348,8 +336,7 @@ def stored(task: Task) -> tuple[Row, ...] | None:
 def work(task: Task) -> tuple[Row, ...]:
     """Fit one test, write its folder at once and return its rows; an error becomes a row.
 
-    Raises InputError if the result cannot be written, and RuntimeError on a machine where the test
-    or foamfit is not that of the caller.
+    Raises InputError if it cannot be written, RuntimeError where files or version are others.
     """
     with _ALONE:
         laws.load_texts(task.recipe.laws)

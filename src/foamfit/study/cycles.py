@@ -19,11 +19,8 @@ from foamfit.parts import ParameterEstimate
 from foamfit.report import figures
 from foamfit.report.folder import Result, brief, write_json, write_result, write_table, write_text
 from foamfit.report.listing import REFUSED, Row, row_of, table_rows
-from foamfit.report.plots import draw_loops
-from foamfit.report.readable import own_name
-from foamfit.report.render import words
-from foamfit.report.studies.parameters import Panel, panels_of, plot_parameters
-from foamfit.report.tables import by_test, by_test_tex, frame, stacked, varied
+from foamfit.report.plots import Values, draw_loops, plot_parameters, values_of
+from foamfit.report.render import by_test, by_test_tex, frame, stacked, varied, words
 from foamfit.results import Fit, stamp
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import counted, percent
@@ -105,13 +102,8 @@ class CycleFits(Result):
     def text(self, *, verbose: bool = False) -> str:
         """Return the text that the command prints."""
         shown = self.varied if len(self.varied) <= MOST_NAMES else {}
-        table = by_test([str(number) for number in sorted(self.results)], shown)
-        heads = [
-            f"{own_name(name, self.model)} ({unit})".removesuffix(" ()")
-            for name, (_, unit) in zip(shown, table["heads"], strict=True)
-        ]
-        cells = {cycle: [p.value if p else "–" for p in row] for cycle, *row in table["rows"]}
-        return words("cycles", found=self, heads=heads, cells=cells)
+        numbers = [str(number) for number in sorted(self.results)]
+        return words("cycles", found=self, shown=list(shown), table=by_test(numbers, shown))
 
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the loops of all cycles, measured and fitted, into axes or a new figure."""
@@ -216,10 +208,7 @@ def fit_cycles(
 
 
 def plot_cycles(found: CycleFits, *, width: str = figures.TWO) -> Figure:
-    """Draw the loops in one panel, and start strain, energy, misfit and parameters by cycle.
-
-    See `plot_parameters`.
-    """
+    """Draw all loops, and start strain, energy, misfit and parameters; see `plot_parameters`."""
     results = dict(sorted(found.results.items()))
     loops = [
         loop._replace(
@@ -230,12 +219,12 @@ def plot_cycles(found: CycleFits, *, width: str = figures.TWO) -> Figure:
         for number, one in results.items()
         if (loop := one.loop) is not None and loop.label == "strain"
     ]
-    rows, panels = list(found.rows()), list[Panel]()
+    rows, panels = list(found.rows()), list[Values]()
     for title, (column, factor) in BY_CYCLE.items():
         known = {f"cycle {row['cycle']}": row[column] for row in rows if row[column] is not None}
         values = {n: ParameterEstimate(factor * x, state="determined") for n, x in known.items()}
-        panels.append(Panel(column, title, values))
+        panels.append(Values(column, title, values))
     names = [f"cycle {number}" for number in results]
-    panels += panels_of(names, found.varied)
+    panels += values_of(names, found.varied)
     title = f"{found.test} · {found.model}"
     return plot_parameters(title, names, panels, width=width, loops=loops)

@@ -4,6 +4,10 @@ Springs in series may have exchanged branches, and a spring may have stayed on i
 each such explanation of the records is a minimum of the cost. Foams are drawn about all of them,
 each weighted by Laplace's approximation of its probability (MacKay 2003, Information Theory,
 Inference, and Learning Algorithms, ch. 28), which prefers the explanation with fewer branches.
+
+Intervals of a joint fit include what follows the tests about as well (`joint_fit`), and what a plan
+expects includes it too: other springs are fitted to the records of a drawn foam in the tests at
+hand and in a candidate, and then, to first order, to those in every other candidate.
 """
 
 from __future__ import annotations
@@ -13,25 +17,32 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import product
+from operator import attrgetter
 
 import numpy as np
 from scipy import stats
 
 from foamfit.arrays import Array, Mask
+from foamfit.data.rig import Candidate, Rig
 from foamfit.errors import SimulationError
+from foamfit.fitting import levenberg
 from foamfit.fitting.box import Space
 from foamfit.fitting.problem import Problem
 from foamfit.fitting.together import Layout, Links, Together, fit_linked
+from foamfit.springs.model import exchanges
 from foamfit.springs.parameters import NUISANCE
 from foamfit.study import gain
-from foamfit.study.gain import Draw, Known, Test
+from foamfit.study.gain import Draw, Known, Other, Test
 from foamfit.trust.best_point import BestPoint
-from foamfit.trust.covariance import NOTHING
+from foamfit.trust.covariance import NOTHING, WEAK
 from foamfit.trust.refits import ALIKE
 from foamfit.trust.settle import in_order, joint_minima
 
 TRIES = 60  # attempts per draw
 FROM = 3  # number of minima from which springs with fewer branches are sought
+MOST, STEPS = 8, 10  # number of other springs that are fitted to a drawn foam, and of their steps
+NEAR = 60.0  # largest rise of the sum of squares, noise having a variance of 1
+EXPLAINED = 3  # number of explanations that are tried besides exchanges
 
 
 def known_of(
@@ -85,16 +96,13 @@ def _reached(tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[st
 def _explanations(
     tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[str]
 ) -> list[Together]:
-    """Return springs in series that explain the tests at hand.
-
-    They are the minima that noise could make the best, best first, and the best springs of which
-    one or more stay on their first branches (`Law.fewer`). These follow the tests about as well
-    with fewer parameters, but no search finds them, as more branches also follow the noise.
-    """
+    """Return springs in series that explain the tests at hand, minima first, best first."""
     problems, model = tuple(one.problem for one in tests), tests[0].problem.model
     links, top = Links(dict.fromkeys(names, "shared")), max(one.scales.stress for one in problems)
     layout = Layout.of(problems, links)
     minima = joint_minima(layout.fitted(layout.start(vectors)))
+    # Springs that stay on their first branches (`Law.fewer`) follow the tests about as well with
+    # fewer parameters, but no search finds them, as more branches also follow the noise.
     simpler = dict[tuple[int, ...], Together]()
     for found in minima[:FROM]:
         own = [model.own(i, found.values[0]) for i in range(len(model.laws))]
@@ -120,14 +128,11 @@ def _held(tests: Sequence[Test], vectors: Sequence[Array], names: Sequence[str])
 
 
 def _of_fits(tests: Sequence[Test], names: Sequence[str]) -> tuple[float, float, Array]:
-    """Return `missed` and `share` of `Known`, and standard errors of each fit over those of JᵀJ.
-
-    A simulated test has neither noise nor model error.
-    """
+    """Return `missed` and `share` of `Known`, and standard errors of each fit over those of JᵀJ."""
     missed, whole, roots = 0.0, 1e-300, np.ones((len(tests), len(names)))
     for t, one in enumerate(tests):
         best, objective = BestPoint(one.problem, one.values), one.problem.objective
-        if one.fit is None:
+        if one.fit is None:  # a simulated test has neither noise nor model error
             continue
         for curve, n, error in zip(objective.counted, objective.sizes, best.errors, strict=True):
             missed, whole = missed + n * error.law**2, whole + n * objective.span(curve) ** 2
@@ -150,19 +155,9 @@ def _stretch(known: Known, tests: Sequence[Test]) -> Array:
 
 
 def _draws(
-    known: Known,
-    tests: Sequence[Test],
-    every: Sequence[Draw],
-    rng: np.random.Generator,
-    count: int,
+    known: Known, tests: Sequence[Test], every: Sequence[Draw], rng: np.random.Generator, count: int
 ) -> tuple[list[Draw], Array]:
-    """Return parameters that follow the tests about as well as the best point.
-
-    Parameters whose branch was reached are drawn from their covariance, including model error, and
-    the others from what the law calls likely, or from the limits of the search; a published set is
-    known but for the former. A draw that raises the cost by more than noise and model error allow
-    is drawn again, nearer to what explains the tests. Also returns the weights of the explanations.
-    """
+    """Return draws that follow the tests about as well as the best, and weights of explanations."""
     problem, k = known.problem, len(known.names)
     space, at = problem.space(), np.array([problem.index[name] for name in known.names])
     measured = any(one.fit is not None for one in tests)
@@ -182,6 +177,8 @@ def _draws(
         inverse = np.linalg.inv(one.bread + prior)
         spread = inverse @ (one.meat + prior) @ inverse + allowed / 1.96**2 * inverse
         power, axes = np.linalg.eigh(spread)
+        # Parameters of other branches are drawn from what the law calls likely, or from the limits
+        # of the search; those of a published set are known.
         axes = np.where(one.reached[:, None], axes * np.sqrt(np.maximum(power, 0.0)), 0.0)
         best = space.encode(one.vectors[0])  # steps are taken in the coordinates of the search
         slopes = space.slopes(best, one.vectors[0])[at] / one.sizes[:, None]
@@ -194,6 +191,7 @@ def _draws(
         chosen = int(rng.choice(len(every), p=weights)) if len(every) > 1 else 0
         one, (best, axes) = every[chosen], steps[chosen]
         found, open_ = one.vectors[0], at[~one.reached & measured]
+        # What noise and model error do not allow is drawn again, nearer to what explains the tests.
         for step in 0.95 ** np.arange(TRIES):
             point = np.clip(best + step * axes @ rng.normal(size=k), *space.box)
             values = _with_open(problem, space, space.decode(point), open_, rng)
@@ -230,3 +228,58 @@ def _with_open(
         if one.place in open_ and one.param is not None:
             point[j] = rng.uniform(*one.param.start_limits)
     return space.decode(point)
+
+
+def with_others(known: Known, tests: Sequence[Test], candidate: Candidate, rig: Rig) -> Known:
+    """Return the same with springs that nearly give the records of each drawn foam."""
+    thin = [replace(one, problem=one.problem.thinned()) for one in tests]
+    search, out = [*thin, gain.as_test(known, candidate, rig)], list(known.drawn)
+    for i, drawn in enumerate(known.draws):
+        every = [(one, one.with_springs(drawn.springs)) for one in tests]
+        pairs = [(one, one.problem.objective.residual(values)) for one, values in every]
+        others = list[Other]()
+        for springs in _sought(known, drawn.springs, drawn.sizes, search):
+            shown = [gain.difference(known, springs, drawn.sizes, *each) for each in pairs]
+            others.append(Other.together(shown))
+        out[i] = replace(drawn, others=tuple(others))
+    return replace(known, drawn=tuple(out))
+
+
+def _sought(known: Known, drawn: Array, sizes: Array, tests: Sequence[Test]) -> list[Array]:
+    """Return springs that nearly give drawn records, nearest first, each with other parameters."""
+    links = Links(dict.fromkeys(known.names, "shared"))
+    layout = Layout.of(tuple(one.problem for one in tests), links)
+    weigh = np.concatenate([one.roots for one in tests])
+
+    def start(springs: Array) -> Array:
+        return layout.start([one.with_springs(springs) for one in tests])
+
+    def residual(point: Array) -> Array:
+        return weigh * (layout.residual(point) - target)
+
+    def jacobian(point: Array) -> Array:
+        return np.asarray(weigh[:, None] * layout.jacobian(point).toarray())
+
+    def left(apart: Array) -> float:
+        """Return what a fit would leave, to first order."""
+        return float(apart @ apart - np.sum((tangent.T @ apart) ** 2))
+
+    target = layout.residual(start(drawn))
+    tangent = np.linalg.qr(jacobian(start(drawn)))[0]
+    springs = drawn[: len(known.problem.model.names)]
+    every = [*known.explained[:EXPLAINED], *exchanges(known.problem.model, springs)]
+    starts = [point for point in map(start, every) if np.all(np.isfinite(residual(point)))]
+    starts = sorted(starts, key=lambda point: left(residual(point)))[:MOST]
+    ends = [
+        levenberg.descend(residual, jacobian, start, layout.box, STEPS, enough=1e-2)
+        for start in starts
+    ]
+    out, covered = list[Array](), np.zeros(len(known.names), dtype=bool)
+    for end in sorted(ends, key=attrgetter("cost")):
+        values, first = layout.terms[0].values(end.point), tests[0].problem
+        found = in_order(first.space(), first.objective, values)
+        far = np.abs(found - drawn)[known.places] > 0.5 * WEAK * sizes
+        if end.cost <= NEAR and (far & ~covered).any():
+            covered |= far
+            out.append(found)
+    return out

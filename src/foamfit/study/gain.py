@@ -25,7 +25,7 @@ from foamfit.data.units import parse_quantity
 from foamfit.errors import InputError, SimulationError
 from foamfit.fitting.objective import Simulated
 from foamfit.fitting.problem import Problem, make_params, make_problem
-from foamfit.report.studies.plan import Expected
+from foamfit.report.plan import Expected
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Impact
 from foamfit.springs.parameters import NUISANCE
@@ -46,15 +46,12 @@ UNITS = {"peak_force": "N", "absorbed_energy": "J", "dissipated_energy": "J", "p
 
 @dataclass(frozen=True, eq=False)
 class Test:
-    """A test at hand or a candidate: its problem and parameters, and the weight of its samples.
-
-    A measured test has its result, and the name of the joint fit that it belongs to.
-    """
+    """A test at hand or a candidate: its problem and parameters, and the weight of its samples."""
 
     problem: Problem
     values: Array
-    fit: FitResult | None = None
-    study: str = ""
+    fit: FitResult | None = None  # of a measured test
+    study: str = ""  # name of the joint fit that it belongs to
     weight: float = 1.0  # samples that the rig records per simulated sample
 
     def with_springs(self, drawn: Array) -> Array:
@@ -90,19 +87,14 @@ class Test:
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """Parameters of the tests at hand that follow them about as well as the best ones.
-
-    `bread` is JᵀJ by the k varied parameters of the springs over their `sizes`, `meat` JᵀΣJ, as
-    slopes may differ much from those of the fit. `others` are springs in series that give nearly
-    the same records.
-    """
+    """Parameters of the tests at hand that follow them about as well as the best ones."""
 
     vectors: tuple[Array, ...]  # of each test
     sizes: Array  # (k,)
-    bread: Array  # (k, k)
-    meat: Array  # (k, k)
+    bread: Array  # (k, k): JᵀJ by the k varied parameters of the springs over their `sizes`
+    meat: Array  # (k, k): JᵀΣJ, as slopes may differ much from those of the fit
     reached: Mask  # (k,): whether the branch of each parameter was reached
-    others: tuple[Other, ...] = ()
+    others: tuple[Other, ...] = ()  # springs in series that give nearly the same records
 
     @property
     def springs(self) -> Array:
@@ -114,21 +106,17 @@ class Draw:
 class Known:
     """What the tests at hand say about the k varied parameters of the springs.
 
-    Of the draws, the first `informed` ones have their own information; the others only tell how
-    probably a limit of the rig is exceeded. `missed` is the sum of squares of the model error,
-    `share` its RMS over the ranges of the curves, `stretch` (k,) the ranges of the fits over those
-    to first order, at least 1. `explained` are vectors with springs in series that explain the
-    tests in other ways, see `draws`.
+    Draws after the first `informed` ones only tell how probably a limit of the rig is exceeded.
     """
 
     problem: Problem
     names: tuple[str, ...]
     drawn: tuple[Draw, ...]
-    informed: int
-    missed: float
-    share: float
-    stretch: Array
-    explained: tuple[Array, ...] = ()
+    informed: int  # number of draws with their own information
+    missed: float  # sum of squares of the model error
+    share: float  # RMS of the model error over the ranges of the curves
+    stretch: Array  # (k,): ranges of the fits over those to first order, at least 1
+    explained: tuple[Array, ...] = ()  # other explanations of the tests by springs in series
 
     @property
     def draws(self) -> tuple[Draw, ...]:
@@ -156,14 +144,11 @@ class Known:
 
 
 class Other(NamedTuple):
-    """Other springs, and what some tests show of their difference from a drawn foam.
-
-    `inner` (k + 1, k + 1) has the products of the slopes by scaled parameters, and of the
-    differences of the residuals as a last column, without nuisance parameters; NaN if a test cannot
-    be simulated. The products of several tests add up.
-    """
+    """Other springs, and what some tests show of their difference from a drawn foam."""
 
     springs: Array
+    # (k + 1, k + 1): products of the slopes by scaled parameters and, as a last column, of the
+    # differences of the residuals; NaN if a test cannot be simulated. Those of tests add up.
     inner: Array
     reached: Mask  # (k,)
 
@@ -174,10 +159,7 @@ class Other(NamedTuple):
         return cls(springs[0], np.sum(inner, axis=0), np.asarray(np.any(reached, axis=0)))
 
     def refit(self, known: Known, sizes: Array) -> tuple[Array, float]:
-        """Return the parameters (k,), scaled, after a fit, and the rise of the sum of squares.
-
-        Both are to first order; the steps are small against the scales `sizes` (k,).
-        """
+        """Return scaled parameters (k,) after a fit, to first order, and the rise of χ²."""
         bread, gradient = self.inner[:-1, :-1], self.inner[:-1, -1]
         step = np.linalg.solve(bread + np.eye(gradient.size) / NOTHING**2, gradient)
         rise = max(float(self.inner[-1, -1] - gradient @ step), 0.0)
@@ -221,12 +203,9 @@ def as_test(
     rig: Rig,
     *,
     record: Measurement | None = None,
-    with_motion: bool = False,
+    with_motion: bool = False,  # whether the motion counts even if the rig does not record it
 ) -> Test:
-    """Return a candidate with the law of the tests at hand, or one whose `record` is given.
-
-    With `with_motion` the motion counts even if the rig does not record it.
-    """
+    """Return a candidate with the law of the tests at hand, or one whose `record` is given."""
     problem, test, impact = known.problem, known.problem.measurement, candidate.drive == "impact"
     if record is None:
         timed = _duration_and_peak(known, candidate) if impact else (0.0, problem.scales.stress)
@@ -307,10 +286,7 @@ def look(
 
 
 def covariance(known: Known, seen: Sequence[Seen], floor: float = TINY) -> tuple[Array, Array]:
-    """Return covariances (d, k, k), scaled: due to noise, and of the range due to model error.
-
-    `floor` is the least information on each parameter over its scale.
-    """
+    """Return covariances (d, k, k), scaled: due to noise, and of the range due to model error."""
     bread = known.of_draws("bread") + sum(one.bread for one in seen)
     meat = known.of_draws("meat") + sum(one.meat for one in seen)
     missed = known.missed + sum(one.missed for one in seen) * np.ones(len(bread))
@@ -322,10 +298,7 @@ def covariance(known: Known, seen: Sequence[Seen], floor: float = TINY) -> tuple
 
 
 def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
-    """Return the expected interval and state of every parameter after some further tests.
-
-    One that may vanish is weak in the draws in which its interval or range would contain zero.
-    """
+    """Return the expected interval and state of every parameter after some further tests."""
     noise, law = (np.diagonal(one, axis1=1, axis2=2) for one in covariance(known, seen))
     halves, ranges = (np.sqrt(np.maximum(one, 0.0)) for one in (NORMAL**2 * noise, law))
     sizes, reached = known.of_draws("sizes"), known.of_draws("reached")
@@ -342,6 +315,7 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
     out = dict[str, Expected]()
     for i, name in enumerate(known.names):
         shown = reached[:, i]
+        # One that may vanish is weak where its interval or range would contain zero.
         sure = ~elsewhere[:, i] & (clear[:, i] if may_vanish(name) else True)
         chance = float(np.mean(shown & (side[:, i] <= WEAK) & sure))
         some = float(np.mean(shown & (wide[:, i] <= NOTHING)))
@@ -358,11 +332,7 @@ def expected(known: Known, seen: Sequence[Seen]) -> dict[str, Expected]:
 def _with_others(
     known: Known, seen: Sequence[Seen], values: Array, halves: Array
 ) -> tuple[Array, Array, Mask]:
-    """Return the ends of intervals, and whether values far outside fit almost as well, (d, k).
-
-    The rule is that of a joint fit (`joint_fit`); intervals extend to other springs that noise
-    could make the best.
-    """
+    """Return the ends of intervals by the rule of `joint_fit`, and where others fit too, (d, k)."""
     low, high, elsewhere = values - halves, values + halves, np.zeros(values.shape, dtype=bool)
     for i, drawn in enumerate(known.draws):
         meat = drawn.meat + sum(one.meat[i] for one in seen)

@@ -33,15 +33,12 @@ from foamfit.study.study_file import AUTO, Study, read_study
 from foamfit.text import counted
 from foamfit.trust import covariance, settle
 
-# Number of tests fitted by a full search; the others start at the results of these.
-SEARCHED = 3
+SEARCHED = 3  # tests fitted by a full search; the others start at the results of these
 # A test is searched as well if its reduced χ² exceeds the largest of those by this factor.
 FAR = 2.0
 STEPS = 60  # of a descent from the result of another test
-# Number of tests whose values are tried as start values of the joint fit for all tests.
-ONE_FOR_ALL = 2
-# Rates with a smaller relative difference count as equal.
-SAME_RATE = 0.02
+ONE_FOR_ALL = 2  # tests whose values are tried as start values of the joint fit for all tests
+SAME_RATE = 0.02  # rates with a smaller relative difference count as equal
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,9 +129,8 @@ def _read(study: Study, options: Options, tell: Progress) -> tuple[list[_Test], 
     _check_two(study, len(found), refused)
     tests, every = list[_Test](), _params(study, [test for _, _, test in found])
     for (name, path, test), params in zip(found, every, strict=True):
-        tests.append(
-            _Test(name, path, options.problem(test, study.model, params), loading_rate(test))
-        )
+        problem = options.problem(test, study.model, params)
+        tests.append(_Test(name, path, problem, loading_rate(test)))
     return tests, refused
 
 
@@ -205,11 +201,8 @@ def _several(rates: Sequence[float | None]) -> bool:
 def _own_fits(
     study: Study, options: Options, tests: list[_Test], refused: dict[str, str], tell: Progress
 ) -> tuple[list[_Test], Together]:
-    """Return the tests that can be fitted, and the results of their separate fits.
-
-    A few tests, spread over the rates, are fitted by a search; the others descend from the results
-    of these, and are searched too if that gives a much larger misfit.
-    """
+    """Return the tests that can be fitted, and the results of their separate fits."""
+    # A few tests, spread over the rates, are searched; the others descend from their results.
     order = sorted(range(len(tests)), key=lambda t: (tests[t].rate or 0.0, t))
     places = np.unique(np.linspace(0, len(order) - 1, min(SEARCHED, len(order))).astype(int))
     first = [order[place] for place in places]
@@ -251,10 +244,7 @@ def _own_fit(test: _Test, model: str, options: Options, near: Sequence[Array]) -
 def evidence(
     fit: Together, names: Sequence[str], kinds: Sequence[str], alone: Together
 ) -> tuple[tuple[Alternative, ...], dict[str, float]]:
-    """Compare these kinds of each of these parameters, leaving the other parameters as they are.
-
-    Also returns the parameters whose slope with rate the tests do not determine, with `open_slope`.
-    """
+    """Compare these kinds of each of these parameters; also return each `open_slope` too wide."""
     found, wide = list[Alternative](), dict[str, float]()
     for name in names:
         present = fit.links.kind(name)
@@ -269,11 +259,7 @@ def evidence(
 def choose_kinds(
     alone: Together, links: Links, names: list[str], starts: Sequence[Vectors], kinds: list[str]
 ) -> Links:
-    """Return links in which these parameters have the kinds of least BIC.
-
-    All are shared at first; each round makes the change of one kind that lowers BIC most. A rate
-    law is not tried if the tests do not determine its slope (`open_slope`).
-    """
+    """Return links in which these parameters have the kinds of least BIC, at first all shared."""
     best = fit_linked(alone.problems, links.having(**dict.fromkeys(names, "shared")), starts)
     now = None
     while best is not now:
@@ -286,11 +272,7 @@ def choose_kinds(
 def _of_kinds(
     fit: Together, name: str, kinds: Sequence[str], alone: Together
 ) -> tuple[dict[str, Together], float]:
-    """Return fits with each of these kinds of a parameter, and its `open_slope`; 0 if unknown.
-
-    The other parameters keep their kinds. Kinds that cannot be simulated are omitted, and rate laws
-    if the slope is not determined.
-    """
+    """Return fits with each kind of a parameter that the tests allow, and its `open_slope` or 0."""
     present, half, out = fit.links.kind(name), 0.0, dict[str, Together]()
     for kind in sorted({present, *kinds}, key=KINDS.index):
         if kind in RATES and kind != present and half > covariance.WEAK:

@@ -196,11 +196,9 @@ def ranges_of(point: JointPoint) -> tuple[dict[str, Ends], list[Together]]:
 
 
 def own_ranges(point: JointPoint, refits: Sequence[Together]) -> tuple[dict[str, Ends], ...]:
-    """Return the ranges due to model error of the values that each test has for itself.
-
-    A range is the hull of values that fit the test almost equally well while the shared values stay
-    where they are (`trust.refits`), and of those in the `refits` with other shared values.
-    """
+    """Return the ranges due to model error of the values that each test has for itself."""
+    # The hull of values that fit the test almost equally well with the same shared values
+    # (`trust.refits`), and of those in the `refits` with other shared values.
     out = []
     for t, best in enumerate(point.bests):
         shared = {name: best.value(name) for name in best.names if name in point.found.shared}
@@ -327,12 +325,7 @@ def _scattering(fit: JointFit, name: str, tests: dict[str, ParameterEstimate]) -
 def _judged(
     fit: JointFit, test: int, name: str, span: Ends | None, *, own: bool = False
 ) -> ParameterEstimate:
-    """Judge the common value, or the `own` one of a `test`, by the wider of interval and range.
-
-    The rule is `trust.covariance.RULE`; limits and scale are those of the test. As in a fit of one
-    test, the interval extends to other minima that different noise could have made the best, and a
-    value far outside it at a minimum hardly worse leaves the parameter weak.
-    """
+    """Judge the common value, or the `own` one of a `test`, by `trust.covariance.RULE`."""
 
     def at(point: JointPoint) -> tuple[float, Error]:
         if own:
@@ -343,6 +336,8 @@ def _judged(
     low, high = limits = fit.point.bests[test].limits(name)
     size, unit = float(problem.sizes((name,), fit.found.values[test])[0]), unit_of(name)
     ends, near = (value - error.half, value + error.half), list[float]()
+    # As in a fit of one test, the interval extends to other minima that different noise could have
+    # made the best, and a value far outside it at a minimum hardly worse leaves it weak.
     for point in fit.others:
         other, around = at(point)
         rise = (point.found.cost - fit.found.cost) / (error.quantile**2 * error.inflation)

@@ -18,14 +18,11 @@ from foamfit.fitting.search import SearchRecord
 from foamfit.fitting.together import Together
 from foamfit.options import RATES
 from foamfit.parts import OfLaw, ParameterEstimate
-from foamfit.report import figures
+from foamfit.report import figures, render
 from foamfit.report.folder import Result, brief, write_json, write_result, write_text
 from foamfit.report.listing import Row, table_of
-from foamfit.report.plots import draw_loops
-from foamfit.report.readable import Readable, readable
-from foamfit.report.render import page, sentences, words
-from foamfit.report.studies.parameters import Panel, plot_parameters
-from foamfit.report.tables import MISFITS, formula, frame, parameters_tex, stacked, symbols
+from foamfit.report.plots import Values, draw_loops, plot_parameters
+from foamfit.report.render import MISFITS, Readable, formula, parameters_tex, readable, symbols
 from foamfit.results import Loop, stamp
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
@@ -42,7 +39,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_NOT_IN_FILE = ("results", "fit")  # fields that joint.json does not contain
 _INPUT = ("velocity", "impulse", "input")  # those about the record, contradictions first
 _OF_A_SEARCH = ("ended", "agree")  # items of the checklist that apply only to a search
 # More than this share of χ², and this multiple of its share of samples, make a test dominant.
@@ -85,12 +81,7 @@ class Alternative:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JointResult(Result, OfLaw):
-    """The result of a joint fit; the fields are those of joint.json, except the last ones.
-
-    "covariance" is that of shared values, common values of scattering parameters, and for rate laws
-    of the values at `rate0` and the slopes (":b"). "specimens" is the correlation of own and
-    scattering parameters between specimens.
-    """
+    """The result of a joint fit; the fields are those of joint.json, except the last ones."""
 
     _kind = "joint.json"
     name: str  #: Name of the study
@@ -101,7 +92,9 @@ class JointResult(Result, OfLaw):
     drive: str | None = None  #: None if the tests have different drives
     seed: int = 0
     rate0: float | None = None  #: Rate of the median test, 1/s
+    #: Of shared and common values, and for rate laws of values at `rate0` and slopes (":b")
     covariance: dict[str, Any] | None = None
+    #: Correlation of own and scattering parameters between specimens
     specimens: dict[str, Any] | None = None
     evidence: tuple[Alternative, ...] = ()
     statistics: dict[str, float | int] = field(default_factory=dict)
@@ -152,12 +145,12 @@ class JointResult(Result, OfLaw):
         common = {n: p for n, p in self.parameters.items() if p.kind != "own"}
         more = ("kind", "scatter", "b")
         columns = {key: {n: getattr(p, key) for n, p in common.items()} for key in more}
-        frames = {"": frame(common, **columns)}
+        frames = {"": render.frame(common, **columns)}
         for test in self.tests:
             own = self.of_test(test)
             kinds = {name: self.parameters[name].kind for name in own}
-            frames[test] = frame(own, kind=kinds, scatter={}, b={})
-        return stacked(frames, "test")
+            frames[test] = render.frame(own, kind=kinds, scatter={}, b={})
+        return render.stacked(frames, "test")
 
     def __repr__(self) -> str:
         """Return name, model, number of tests, status and the common values."""
@@ -171,14 +164,14 @@ class JointResult(Result, OfLaw):
         known = [one.misfit for one in self.tests.values()]
         curves = [n for n in MISFITS if any(misfit.get(n) is not None for misfit in known)]
         more: Any = {"parameters": every, "nuisance": NUISANCE, "shown": _shown}
-        return words("joint", found=self, most=MOST_ROWS, curves=curves, **more)
+        return render.words("joint", found=self, most=MOST_ROWS, curves=curves, **more)
 
     def write(self, folder: Path, *, pages: bool = True, width: str = figures.TWO) -> None:
         """Write joint.json, its page, its figure, table.tex, and a result folder per test."""
         write_json(folder / "joint.json", self.to_json_dict())
         shown = self.of_springs
         kinds = {name: one.kind for name, one in shown.items()}
-        between = {name: _between(one) for name, one in shown.items()}
+        between = {name: render.words("between", one=one) for name, one in shown.items()}
         write_text(folder / "table.tex", parameters_tex(shown, kinds=kinds, between=between))
         for name, one in self.results.items():
             (folder / name).mkdir()
@@ -189,8 +182,8 @@ class JointResult(Result, OfLaw):
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of joint.json: SI units, plain types, null for missing values."""
-        model, names = Model.parse(self.model), (one.name for one in fields(self))
-        shown = {name: getattr(self, name) for name in names if name not in _NOT_IN_FILE}
+        model, names = Model.parse(self.model), [one.name for one in fields(self)]
+        shown = {name: getattr(self, name) for name in names if name not in ("results", "fit")}
         content: dict[str, Any] = plain(stamp() | shown | {"model": model.words, **model.options})
         for one in content["parameters"].values():
             one["state"] = one["state"] or None  # of an own parameter
@@ -205,20 +198,16 @@ def _shown(name: str, one: ParameterEstimate) -> Readable:
     return readable(name, one)
 
 
-def _between(one: ParameterEstimate) -> str:
-    """Return a description of the variation of a parameter between the tests."""
-    return words("between", one=one)
-
-
 def joint_page(found: JointResult, folder: Path, figure: bytes) -> str:
     """Return the page in a folder, with its figure (SVG)."""
     rows = [
         Row(test, misfit=own.misfit, parameters=found.of_test(test), more=_more(found, own))
         for test, own in found.tests.items()
     ]
-    shown = [(one, readable(name, one), _between(one)) for name, one in found.of_springs.items()]
+    every = found.of_springs.items()
+    shown = [(one, readable(name, one), render.words("between", one=one)) for name, one in every]
     told: dict[str, Any] = {"found": found, "figure": figure, "parameters": shown, "rule": RULE}
-    return page("joint", table=table_of(rows, folder), **told)
+    return render.page("joint", table=table_of(rows, folder), **told)
 
 
 def _more(found: JointResult, own: JointTest) -> dict[str, Any]:
@@ -230,36 +219,26 @@ def _more(found: JointResult, own: JointTest) -> dict[str, Any]:
         if (level := own.noise.get(curve)) is not None:
             unit = "m" if curve.startswith("displ") else "Pa"
             factor, unit = readable_unit(max(levels), unit)
-            note = words("noise", level=level, factor=factor)
+            note = render.words("noise", level=level, factor=factor)
             out[f"noise {MISFITS[curve]} ({unit})"] = (number(level["sigma"] / factor), note)
     return out
 
 
 def plot_joint(found: JointResult, *, width: str = figures.TWO) -> Figure:
-    """Draw the loops, and below them the parameters of all tests side by side.
-
-    Tests are sorted by rate if rates differ; see `plot_parameters`.
-    """
+    """Draw the loops, and below them the parameters of all tests; see `plot_parameters`."""
     names, every = _in_order(found), found.loops
     loops = [every[test]._replace(name=name) for test, name in names.items() if test in every]
-    panels = [
-        Panel(
-            name,
-            formula(own),
-            {names[t]: one.in_test(t) for t in names if t in (one.tests or {})},
-            joint=one,
-        )
-        for own, (name, one) in zip(symbols(found.varied), found.varied.items(), strict=True)
-    ]
+    panels = list[Values]()
+    for name, own in symbols(found.varied).items():
+        one = found.parameters[name]
+        each = {names[t]: one.in_test(t) for t in names if t in (one.tests or {})}
+        panels.append(Values(name, formula(own), each, joint=one))
     title = f"{found.name} · {found.law} · {len(names)} tests together"
     return plot_parameters(title, list(names.values()), panels, width=width, loops=loops)
 
 
 def _in_order(found: JointResult) -> dict[str, str]:
-    """Return the displayed names of the tests; if rates differ, sorted by rate and with the rate.
-
-    Rates differ if a parameter follows a rate law, or by the factor `SEVERAL_RATES`.
-    """
+    """Return the displayed names of the tests; if rates differ, sorted by rate and with it."""
     rates = {test: one.rate or 0.0 for test, one in found.tests.items()}
     law = any(one.kind in RATES for one in found.parameters.values())
     if not law and not 0.0 < SEVERAL_RATES * min(rates.values()) < max(rates.values()):
@@ -291,24 +270,19 @@ def result_of(
     tests: Mapping[str, Path],
     rates: Sequence[float | None],
     fit: JointFit,
-    alone: Together,
-    slopes: Mapping[str, float],
-    **about: Any,
+    alone: Together,  # the separate fits
+    slopes: Mapping[str, float],  # those of `joint.evidence`
+    **about: Any,  # further fields of the result
 ) -> JointResult:
-    """Return the result of a joint fit of `tests` (names and files) at these rates (1/s).
-
-    `alone` are the separate fits, and `slopes` those of `joint.evidence`. `about` has further
-    fields of the result.
-    """
+    """Return the result of a joint fit of `tests` (names and files) at these rates (1/s)."""
     found, parameters = fit.found, parameters_of(fit, tuple(tests))
     total = float(np.sum(found.costs))
     shares = np.divide(found.costs, total) if total else np.full(len(tests), 1.0 / len(tests))
     others = counted(len(tests) - 1, "other test")
     note = f"Fitted together with {others} ({study.name}): intervals use all of them."
     of_tests, results = dict[str, JointTest](), dict[str, FitResult]()
-    for (name, file), rate, best, share in zip(
-        tests.items(), rates, fit.point.bests, shares.tolist(), strict=True
-    ):
+    every = zip(tests.items(), rates, fit.point.bests, shares.tolist(), strict=True)
+    for (name, file), rate, best, share in every:
         results[name] = one = fit_of_test(best, parameters, name, note, study.seed)
         of_tests[name] = JointTest(
             file=str(file),
@@ -388,9 +362,9 @@ def _with_words(
     told |= {"top": (first, top), "dominant": max(DOMINANT, MORE * top.n_data / fit.found.n_data)}
     told |= {"together": _span_of(fit.found.misfits), "alone": _span_of(alone.misfits)}
     told |= {"n_vary": fit.found.n_vary, "scaled": _scaled(result, fit)}
-    warnings = sentences("joint_warnings", **told)
+    warnings = render.sentences("joint_warnings", **told)
     status = "failed" if lost else "warnings" if warnings else "ok"
-    said = sentences("joint_sentences", **told)
+    said = render.sentences("joint_sentences", **told)
     return replace(result, status=status, warnings=warnings, sentences=said)
 
 

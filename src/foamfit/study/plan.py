@@ -28,16 +28,15 @@ from foamfit.fitting.nuisance import VELOCITY
 from foamfit.fitting.problem import make_params, make_problem
 from foamfit.one_model import Progress
 from foamfit.parts import law_in_words
-from foamfit.report.studies.plan import Expected, Outcome, Plan, Quantity
+from foamfit.report.plan import Expected, Outcome, Plan, Quantity
 from foamfit.solve.simulation import simulate
 from foamfit.springs.chain import Chain, Impact
 from foamfit.springs.published import published
 from foamfit.study import gain
-from foamfit.study.draws import known_of
+from foamfit.study.draws import known_of, with_others
 from foamfit.study.gain import Known, Seen, Test
+from foamfit.study.identified import load, with_record
 from foamfit.study.joint_result import JointResult
-from foamfit.study.others import with_others
-from foamfit.study.saved import load, with_record
 from foamfit.text import counted
 
 DRAWS = 40  # number of drawn foams
@@ -150,9 +149,6 @@ def plan(
     )
 
 
-# ------------------------------------------------------------------ the tests at hand
-
-
 def _as_fitted(tests: Sequence[Test]) -> dict[str, Any]:
     """Return the drives, and the spring parameters held elsewhere than by default, SI."""
     problem, drives = tests[0].problem, {one.problem.objective.drive for one in tests}
@@ -239,9 +235,6 @@ def _now(known: Known, tests: Sequence[Test]) -> dict[str, Expected]:
     return out
 
 
-# ------------------------------------------------------------------ the advice
-
-
 def _outcome(known: Known, target: gain.Target | None, one: Candidate, *seen: Seen) -> Outcome:
     """Return what a candidate would determine, together with others of which more is seen."""
     risk, found = np.any([each.broken for each in seen], axis=0), gain.expected(known, seen)
@@ -250,12 +243,10 @@ def _outcome(known: Known, target: gain.Target | None, one: Candidate, *seen: Se
 
 
 def _advised(safe: Sequence[Outcome], now: float) -> Outcome | None:
-    """Return the advised one of some safe tests; None if there are none.
-
-    It is the softest of those that determine most parameters with the narrowest intervals, or with
-    a quantity asked for the one with its least error; if none determines more than `now`, it is the
-    one with the narrowest intervals. With rivals it tells them apart, if a test can.
-    """
+    """Return the advised one of some safe tests; None if there are none."""
+    # The softest of those that determine most parameters with the narrowest intervals, or with a
+    # quantity asked for the one with its least error; if none determines more than `now`, the one
+    # with the narrowest intervals. With rivals it tells them apart, if a test can.
 
     def least_apart(one: Outcome) -> float:
         return min(one.apart.values(), default=math.inf)
@@ -296,11 +287,7 @@ def _beyond(known: Known, shown: Sequence[dict[str, Expected]], rig: Rig) -> dic
 
 
 def _closing(known: Known, mass: float, rig: Rig) -> tuple[float, float]:
-    """Return the least velocities that reach every branch in half and in 95 % of the draws, m/s.
-
-    With a dashpot a faster striker may leave before the foam has snapped back, so the first of
-    several velocities that reach every branch is refined.
-    """
+    """Return the least velocities that reach every branch in half and in 95 % of the draws, m/s."""
     top = 2.0 * rig.velocity[1]
     speeds = np.geomspace(*rig.velocity, 4).tolist()
     made = [gain.as_test(known, Candidate("impact", mass, speed), rig) for speed in speeds]
@@ -315,6 +302,7 @@ def _closing(known: Known, mass: float, rig: Rig) -> tuple[float, float]:
             return True  # beyond the lock-up
         return bool(test.reached(shown, known.names).all())
 
+    # With a dashpot a faster striker may leave before the foam has snapped back: refine the first.
     tried = np.geomspace(top / SLOWEST, top, SPEEDS).tolist()
     for values in (test.with_springs(one.springs) for one in known.drawn):
         first = next((i for i, speed in enumerate(tried) if closed(speed, values)), None)

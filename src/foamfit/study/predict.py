@@ -25,21 +25,18 @@ from foamfit.fitting.search import Tracker, descend
 from foamfit.parts import ParameterEstimate
 from foamfit.report import render
 from foamfit.report.folder import Result
-from foamfit.report.studies.prediction import COLOURS, PredictedCurve, Prediction
+from foamfit.report.prediction import COLOURS, PredictedCurve, Prediction
 from foamfit.springs.parameters import NUISANCE, unit_of
-from foamfit.study.identified import NORMAL, Source, read_source
-from foamfit.study.population import Population
+from foamfit.study.identified import NORMAL, Population, Source, read_source
 from foamfit.text import ASKED
 from foamfit.trust import say
 
 DRAWS = 400  # default number of draws of specimens
 FEWEST = 40  # least number of draws: fewer do not resolve the ends of a 95 % band
-# Factor by which the rate of a test may lie outside the fitted rates.
-RATE_FACTOR = 1.25
+RATE_FACTOR = 1.25  # by which the rate of a test may lie outside the fitted rates
 TRIES = 5  # largest number of attempts per draw
 BAND = (0.025, 0.975)
-# Number of tests that gives no warning; fewer suffice if fewer parameters scatter.
-FEW_TESTS = 5
+FEW_TESTS = 5  # that give no warning; fewer suffice if fewer parameters scatter
 # Least fraction of the samples inside the band that gives no warning. It is below 0.95, as an error
 # of a parameter moves many samples together.
 LEAST_INSIDE = 0.8
@@ -113,8 +110,8 @@ def predict(
     values, drawn, redrawn = list[Array](), list[dict[str, Array]](), 0
     if population.scattering:
         values, drawn, redrawn = _draw(population, problem, point, draws, seed)
-    halves = {"parameters": _by_parameters(population, aligning, point, tuple(aligned))}
-    halves |= {"motion": _by_motion(problem, point)}
+    by_parameters = _by_parameters(population, aligning, point, tuple(aligned))
+    halves = {"parameters": by_parameters, "motion": _by_motion(problem, point)}
     bands = dict[str, PredictedCurve]()
     for name in objective.counted:
         parts = {part: of_curves[name] for part, of_curves in halves.items() if name in of_curves}
@@ -146,8 +143,8 @@ def predict(
     told |= {"outside": outside, "doubts": _doubts(problem), "nearest": nearest, "enough": enough}
     told |= {"draws": draws, "again": same and later > 1, "least": LEAST_INSIDE}
     told |= {"nuisance": NUISANCE, "unit_of": unit_of}
-    said, warned = (f"predicted_{kind}" for kind in ("sentences", "warnings"))
-    sentences, warnings = render.sentences(said, **told), render.sentences(warned, **told)
+    sentences = render.sentences("predicted_sentences", **told)
+    warnings = render.sentences("predicted_warnings", **told)
     return replace(found, sentences=sentences, warnings=warnings)
 
 
@@ -189,10 +186,8 @@ def _problem(source: Source, measurement: Measurement, drive: str | None) -> Pro
     with suppress(InputError):  # if this record cannot have the time shift of the fitted one
         curves.check_time_shift(measurement, chosen)
         shift = source.time_shift
-    law, terms = source.model.name, source.model.relaxation
-    problem = make_problem(
-        measurement, law, chosen, None, None, inside, time_shift=shift, relaxation=terms
-    )
+    more: Any = {"time_shift": shift, "relaxation": source.model.relaxation}
+    problem = make_problem(measurement, source.model.name, chosen, None, None, inside, **more)
     objective, same = problem.objective, source.sha256 == measurement.data_sha256
     if not same or source.smoothed is None or chosen != "displacement":
         return problem
@@ -345,7 +340,7 @@ def _curve(
     law_error = span * source.law_errors.get(channel, 0.0)
     parts["law_error"] = law_error * np.sqrt(_growth(problem.measurement, source))
     contained = {"scatter", "parameters"} if drawn else {"scatter"}  # in the draws
-    more = sum(parts[part] ** 2 for part in parts.keys() - contained)
+    more = sum(half**2 for part, half in parts.items() if part not in contained)
     kept = np.zeros(n, dtype=bool)
     kept[objective.kept[name]] = True
     return PredictedCurve(

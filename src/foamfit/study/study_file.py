@@ -20,8 +20,11 @@ from foamfit.springs.model import Model
 from foamfit.springs.parameters import NUISANCE
 from foamfit.text import listed
 
-# Kind of a parameter for which the evidence decides between `KINDS`.
-AUTO = "auto"
+AUTO = "auto"  # kind of a parameter for which the evidence decides between `KINDS`
+ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
+WANTED = f"a test is a table that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
+_SPECIMENS = ("specimen", "specimens")  # stems of tables that list them next to the tests
+_WRITTEN = set[str]().union(*FILES.values())
 
 
 def _text(right: str) -> Rule:
@@ -47,11 +50,7 @@ _KEYS: dict[str, Check] = {
 
 @dataclass(frozen=True)
 class Study:
-    """The content of a study file.
-
-    `kinds` maps parameters to one of `options.KINDS` or "auto"; `held` maps fixed parameters to
-    their values (SI).
-    """
+    """The content of a study file."""
 
     path: Path
     name: str
@@ -59,8 +58,8 @@ class Study:
     model: str
     relaxation: int
     drive: str | None
-    kinds: Mapping[str, str]
-    held: Mapping[str, float]
+    kinds: Mapping[str, str]  # by parameter, one of `options.KINDS` or "auto"
+    held: Mapping[str, float]  # values of fixed parameters, SI
     seed: int = 0
     cycle: int | None = None
     starts: int | None = None
@@ -94,10 +93,8 @@ def read_study(path: str | Path) -> Study:
 
 def _tests(path: Path, content: Mapping[str, Any]) -> tuple[tuple[str, Path, Path | None], ...]:
     """Return tests with their TOML: from [specimens], or else the key specimen."""
-    try:
+    with naming("tests"):
         found = find_tests(content["tests"], path.parent)
-    except InputError as error:
-        raise InputError(f"tests: {error}") from None
     if len(found) < 2:
         why = f"tests names {'one test' if found else 'none'}; a joint fit needs at least two"
         raise InputError(why)
@@ -132,13 +129,6 @@ def _parameters(table: Mapping[str, Any], model: Model) -> tuple[dict[str, str],
             why = f"{where} = {value!r} must be one of {wanted}, or a number (SI) to fix it"
             raise InputError(why)
     return kinds, held
-
-
-ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".gz", ".xlsx")
-WANTED = f"a test is a table that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
-# Stems of tables that list the specimens next to the tests.
-_SPECIMENS = ("specimen", "specimens")
-_WRITTEN = set[str]().union(*FILES.values())
 
 
 def find_tests(

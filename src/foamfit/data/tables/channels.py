@@ -76,9 +76,10 @@ def read_channels(source: Source, duplicates: str, delay: float = 0.0) -> Channe
     notes = [source.note()]
     for channel, values in numbers.items():
         column = f"column {source.name(channel)}"
-        if np.ptp(values) == 0:
+        if values.min() == values.max():
             raise InputError(f"{column} is constant; a {channel} must vary.")
-        numbers[channel] = values * factors[channel]
+        with np.errstate(over="ignore"):  # what overflows is refused below
+            numbers[channel] = values * factors[channel]
         if not 1.0 / LARGEST < np.max(np.abs(numbers[channel])) < LARGEST:
             raise InputError(
                 f"{column} is up to {np.max(np.abs(values)):.3g} in the file, which cannot be a "

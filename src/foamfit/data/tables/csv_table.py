@@ -156,7 +156,7 @@ def find_table(text: Text, names: set[str | int]) -> Table:
     if found is None or not any(map(_is_sample, grids[found[0]][found[1] :])):
         rows = (sum(map(_is_sample, grid)) > 2 for grid in grids.values())
         tabbed = None if any(rows) else blanks_as_tabs(text.content)
-        if tabbed is not None:
+        if tabbed not in (None, text.content):
             return find_table(replace(text, content=tabbed), names)
     separator, i = found or _above_numbers(grids, names)
     grid = grids[separator]
@@ -194,7 +194,9 @@ def _cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str
 def _header_row(grids: dict[str, list[list[str]]], names: set[str]) -> tuple[str, int] | None:
     """Return separator and index of the row that names most channels, None if none does."""
     best, found = 0, None
-    for separator, grid in grids.items():
+    # On a tie the first separator wins, so those that divide the numbers come first.
+    first = sorted(grids, key=lambda separator: not any(map(_is_sample, grids[separator])))
+    for separator, grid in ((separator, grids[separator]) for separator in first):
         numbers = False
         for i, cells in enumerate(grid):
             # On a tie the last row wins, as titles and instrument settings precede the header.

@@ -24,10 +24,10 @@ class Channel(NamedTuple):
 _MOVED = "displacement disp weg standardweg verschiebung stauchung compression"
 CHANNELS = {
     "time": Channel("s", "ms", "time t zeit prüfzeit testzeit versuchszeit timestamp"),
-    "stress": Channel("Pa", "MPa", "stress sigma druckspannung spannung"),
+    "stress": Channel("Pa", "MPa", "stress sigma σ druckspannung spannung"),
     "force": Channel("N", "N", "force load f kraft standardkraft prüfkraft druckkraft"),
     "displacement": Channel("m", "mm", _MOVED),
-    "strain": Channel("", "%", "strain eps epsilon dehnung stauchung compression"),
+    "strain": Channel("", "%", "strain eps epsilon ε dehnung stauchung compression"),
     "acceleration": Channel("m/s**2", "m/s^2", "acceleration accel deceleration beschleunigung"),
     "velocity": Channel("m/s", "m/s", "velocity speed geschwindigkeit"),
     "cycle": Channel("", "", ""),  # assigned in [columns] only
@@ -119,6 +119,7 @@ def parse_header(text: str) -> Header:
     bracket = re.fullmatch(r"(.*)[(\[{]([^()\[\]{}]*)[)\]}]", text)
     bracket = bracket or re.fullmatch(r"(.+) (?:/|in) (\S+)", text)
     bracket = bracket or re.fullmatch(r"(.+?)\.\.(\S+)\.", text)  # Time..s., as R writes it
+    bracket = bracket or re.fullmatch(r"(.+\w)(%)", text)
     if bracket:
         name, unit = bracket[1], bracket[2].strip()
         words = _words(f"{name} ({unit})")
@@ -157,7 +158,7 @@ def _words(name: str) -> tuple[str, ...]:
 
 
 def _split(name: str) -> list[str]:
-    return [word for word in re.split(r"[\s_:;.,#()\[\]{}\-–]+", name.lower()) if word]
+    return [word for word in re.split(r"[\s_:;.,|#()\[\]{}\-–]+", name.lower()) if word]
 
 
 def channel_of(name: str) -> Channel:

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from foamfit.arrays import Array
+from foamfit.arrays import Array, Mask
 from foamfit.codec import plain
 from foamfit.data.cycles import cycles_of
 from foamfit.data.measurement import Measurement
@@ -42,10 +41,7 @@ BAND: tuple[str, dict[str, Any]] = ("95 % band", {"color": VERMILION, "alpha": 0
 
 @dataclass(frozen=True, eq=False)
 class PredictedCurve:
-    """A curve of a test with its 95 % band, one row per sample, in Pa or m.
-
-    `parts` contains the half width (n,) of the band due to each source of uncertainty alone.
-    """
+    """A curve of a test with its 95 % band, one row per sample, in Pa or m."""
 
     channel: str  # "stress", "displacement", "displacement_1", …
     unit: str
@@ -53,8 +49,8 @@ class PredictedCurve:
     predicted: Array
     lo: Array
     hi: Array
-    parts: dict[str, Array]
-    kept: NDArray[np.bool_]  # Samples that count: measured ones that are not outliers
+    parts: dict[str, Array]  # Half width (n,) of the band due to each source of uncertainty alone
+    kept: Mask  # Samples that count: measured ones that are not outliers
 
     @property
     def range(self) -> float:
@@ -144,10 +140,7 @@ class Prediction(Result, OfLaw):
 
     @property
     def by_cycle(self) -> dict[int, dict[str, float]]:
-        """Misfit over the range, and fraction inside the band, of each of several cycles.
-
-        The curve is the stress if the motion is prescribed, otherwise the first curve.
-        """
+        """Misfit over range and fraction inside the band by cycle, of the stress or first curve."""
         curve = self.curves.get("stress_time", next(iter(self.curves.values())))
         return {n: curve.met(part) for n, part in cycles_of(self.measurement).items()}
 
@@ -201,10 +194,7 @@ class Prediction(Result, OfLaw):
 
 
 def plot_prediction(found: Prediction, *, width: str = TWO) -> Figure:
-    """Draw the loop, and each curve with its band and the half width due to each part below.
-
-    For `width` see `plots.plot_fit`.
-    """
+    """Draw the loop, and each curve with its band and below its parts; `width` as in `plot_fit`."""
     inside = ", ".join(f"{c.channel} {percent(c.inside, 3)}" for c in found.curves.values())
     about = f"{found.measurement.name}, predicted from {found.source}"
     title = f"{about}; {words('rates', found=found)}", f"inside the 95 % band: {inside}"

@@ -17,8 +17,7 @@ from foamfit.parts import OfLaw
 from foamfit.report import figures
 from foamfit.report.figures import BLUE, GREY, TWO, VERMILION
 from foamfit.report.folder import Result, write_json, write_text
-from foamfit.report.readable import own_name
-from foamfit.report.render import page, sentences, words
+from foamfit.report.render import own_name, page, sentences, words
 from foamfit.results import stamp
 from foamfit.springs.model import Model
 from foamfit.springs.parameters import unit_of
@@ -32,22 +31,21 @@ if TYPE_CHECKING:
 RISKY = 0.05  # largest probability of exceeding a limit of an advised test
 SHOWN = 3.2  # largest half interval over the scale of a parameter that the figure shows
 BEST = 12  # rows of the table of tests on the page
+# What plan.json says of a candidate, and the name of it in `Outcome`.
+IN_FILE = {"breaks": "breaks", "number_determined": "number", "expected": "expected"}
+IN_FILE |= {"peak_force": "force", "quantity_error": "error", "told_apart": "apart"}
+SETTINGS = ("drive", "mass", "velocity", "strain", "rate", "cycles", "hold", "interior", "repeat")
 
 
 @dataclass(frozen=True)
 class Expected:
-    """What is expected of a parameter: 95 % interval and state.
+    """What is expected of a parameter: 95 % interval and state."""
 
-    `ci95_width` is the median width of the interval over the draws (SI; NaN where it is unknown),
-    and `ci95_width_10_90` their 10 and 90 % quantiles. `share` is half of it, not cut at limits,
-    over the scale of the parameter, and `probability` that with which the parameter is determined.
-    """
-
-    ci95_width: float
+    ci95_width: float  #: median width of the interval over the draws, SI; NaN where it is unknown
     state: str
-    ci95_width_10_90: tuple[float, float]
-    probability: float
-    share: float
+    ci95_width_10_90: tuple[float, float]  #: 10 and 90 % quantiles of the widths
+    probability: float  #: with which the parameter is determined
+    share: float  #: half the median width, not cut at limits, over the scale of the parameter
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,38 +175,24 @@ class Plan(Result, OfLaw):
 
     def to_json_dict(self) -> dict[str, Any]:
         """Return the content of ``plan.json``: SI, plain types, None for missing values."""
-        best = self.advice
+        best, content = self.advice, {**stamp(), "tests": [one.name for one in self.tests]}
+        content |= {key: getattr(self, key) for key in ("model", "relaxation", "seed")}
+        keys = ("determined", "open", "breaks", "expected")
+        content["advice"] = best and _asked(best.candidate) | {
+            key: getattr(best, key) for key in keys
+        }
+        content["now"] = self.now
+        content["candidates"] = [
+            _asked(one.candidate) | {key: getattr(one, name) for key, name in IN_FILE.items()}
+            for one in self.outcomes
+        ]
         pair = self.pair and [_asked(self.pair[0].candidate), _asked(self.pair[1])]
-        content: dict[str, Any] = plain({
-            **stamp(),
-            "tests": [one.name for one in self.tests],
-            "model": self.model,
-            "relaxation": self.relaxation,
-            "seed": self.seed,
-            "advice": best and _asked(best.candidate) | {
-                "determined": best.determined, "open": best.open, "breaks": best.breaks,
-                "expected": best.expected,
-            },
-            "now": self.now,
-            "candidates": [
-                _asked(one.candidate) | {
-                    "breaks": one.breaks, "number_determined": one.number,
-                    "expected": one.expected, "peak_force": one.force,
-                    "quantity_error": one.error, "told_apart": one.apart,
-                }
-                for one in self.outcomes
-            ],
-            "pair": pair and {"tests": pair, "determined": self.pair and self.pair[0].determined},
-            "never_determined": self.never,
-            "closing_velocity": [
-                {"mass": mass, "half": ends[0], "sure": ends[1]}
-                for mass, ends in self.closing.items()
-            ],
-            "quantity": self.quantity,
-            "rig": self.rig,
-            "sentences": self.sentences,
-        })  # fmt: skip
-        return content
+        content["pair"] = self.pair and {"tests": pair, "determined": self.pair[0].determined}
+        closing = self.closing.items()
+        ends = [{"mass": mass, "half": half, "sure": sure} for mass, (half, sure) in closing]
+        content |= {"never_determined": self.never, "closing_velocity": ends}
+        content |= {key: getattr(self, key) for key in ("quantity", "rig", "sentences")}
+        return dict(plain(content))
 
     def text(self, *, verbose: bool = False) -> str:
         """Return the text that the command prints."""
@@ -229,9 +213,6 @@ class Plan(Result, OfLaw):
             shown: dict[str, Any] = {"plan": self, "best": ranked[:BEST], "risky": RISKY}
             shown["svg"] = figures.write_both(plot_plan(self, width=width), folder / "plan")
             write_text(folder / "plan.html", page("plan", unit_of=unit_of, **shown))
-
-
-SETTINGS = ("drive", "mass", "velocity", "strain", "rate", "cycles", "hold", "interior", "repeat")
 
 
 def _asked(one: Candidate) -> dict[str, Any]:
@@ -257,24 +238,19 @@ def plot_plan(plan: Plan, *, width: str = TWO) -> Figure:
 
 
 def _map(ax: Axes, plan: Plan) -> None:
-    """Draw the expected number of determined parameters against the settings of the tests.
-
-    Of several tests with the same settings the best counts. Tests that exceed a limit with more
-    than 5 % probability are hatched.
-    """
+    """Draw the expected number of determined parameters against the settings of the tests."""
     impact, table = bool(plan.rig.masses), plan.table()
     axes = ("velocity", "mass") if impact else ("rate", "strain")
-    best = (
-        table[~table["repeat"].astype(bool)].sort_values("determined").groupby([*axes[::-1]]).last()
-    )
+    single = table[~table["repeat"].astype(bool)]
+    # Of several tests with the same settings the best counts; risky ones are hatched.
+    best = single.sort_values("determined").groupby([*axes[::-1]]).last()
     count, risk = best["determined"].unstack(), best["breaks"].unstack()
     x, y = count.columns.astype(float).to_list(), count.index.astype(float).to_list()
     style: Any = {"facecolor": "none", "edgecolor": VERMILION, "hatch": "////", "linewidth": 0.0}
     for row, column in np.argwhere(risk.to_numpy() > RISKY):
         ax.fill_between((column - 0.5, column + 0.5), row - 0.5, row + 0.5, **style)
-    shown = ax.imshow(
-        count, cmap="Blues", vmin=0, vmax=len(plan.now), origin="lower", aspect="auto"
-    )
+    style = {"cmap": "Blues", "vmin": 0, "vmax": len(plan.now), "origin": "lower"}
+    shown = ax.imshow(count, aspect="auto", **style)
     at = plan.advice and [getattr(plan.advice.candidate, name) for name in axes]
     if at and at[0] in x and at[1] in y:
         star: Any = {"color": VERMILION, "ms": 11, "mec": "white", "ls": "none"}

@@ -1,1 +1,0 @@
-"""Output for several tests at once: tables, pages and figures of `foamfit.study`."""
