@@ -14,10 +14,9 @@ import numpy as np
 from numba import njit
 
 import foamfit as ff
-from foamfit.springs import laws
-from foamfit.springs.laws import bistable
+from foamfit.springs.laws import bistable, law
 
-PAPER = laws.law("bistable")
+PAPER = law("bistable")
 points_of = njit(bistable.derived_points)
 A, D, C, E = range(4)  # branches
 
