@@ -76,14 +76,7 @@ def make_params(
         model = Model.parse(with_options(model, **options), relaxation)
     drive = curves.choose_drive(measurement) if drive is None else drive
     scales = Scales.of(measurement)
-    wanting = ["relaxation"] if model.relaxation else []
-    wanting += [f"the stress of '{law.kind}'" for law in model.laws if law.is_viscous]
-    if measurement.time is None and wanting:
-        end = "; give one, or leave relaxation out" if model.relaxation else ""
-        raise InputError(f"{measurement.name}: {wanting[0]} needs a time column{end}")
-    if (motion := measurement.displacement) is not None and motion.max() <= motion[0]:
-        wrong = f"{measurement.name}: the displacement does not rise in the part that is used"
-        raise InputError(f"{wrong}; choose a part with a loading by [window]")
+    _check_record(measurement, model)
     params, count = lmfit.Parameters(), len(model.kinds)
     fast = drive == "impact"
     on_striker = fast and (count > 1 or balance(measurement).damping is not None)
@@ -356,6 +349,40 @@ class Problem:
         return follow(self.tied, values, moves, 1e-5 * self.sizes(names, values))
 
 
+def _check_record(measurement: Measurement, model: Model) -> None:
+    """Raise InputError if a record has no time that its law needs, or no loading."""
+    wanting = ["relaxation"] if model.relaxation else []
+    wanting += [f"the stress of '{law.kind}'" for law in model.laws if law.is_viscous]
+    if measurement.time is None and wanting:
+        end = "; give one, or leave relaxation out" if model.relaxation else ""
+        raise InputError(f"{measurement.name}: {wanting[0]} needs a time column{end}")
+    if (motion := measurement.displacement) is not None and motion.max() <= motion[0]:
+        wrong = f"{measurement.name}: the displacement does not rise in the part that is used"
+        raise InputError(f"{wrong}; choose a part with a loading by [window]")
+
+
+def _put(
+    wanted: lmfit.Parameters, params: lmfit.Parameters, where: str, model: str, drive: str
+) -> None:
+    """Put the user's parameters in place of the usual ones, whose limits stay where none is given.
+
+    Raises InputError for one that does not exist, or that nothing would show.
+    """
+    for name in params:
+        _check_known(f"parameter '{name}'", name, model, wanted)
+    for name, one in copied(params).items():
+        usual, wanted[name] = wanted[name], one
+        if name in NUISANCE and one.vary and not math.isfinite(one.max - one.min):
+            if not math.isfinite(usual.max - usual.min):
+                raise InputError(
+                    f"{where}'{name}' cannot vary, as the {drive} drive of this test has nothing "
+                    "that would show it; leave it fixed"
+                )
+            ends = (one.min, usual.min), (one.max, usual.max)
+            low, high = (own if math.isfinite(own) else other for own, other in ends)
+            one.set(min=low, max=high)
+
+
 def make_problem(
     measurement: Measurement,
     model_name: str,
@@ -395,24 +422,8 @@ def make_problem(
     measurement = objective.measurement  # it has the noise of each channel
     wanted = make_params(measurement, model, drive, time_shift=time_shift)
     usual = wanted.valuesdict()
-    limits = {name: (one.min, one.max) for name, one in wanted.items() if name in NUISANCE}
-    for name in params or ():
-        _check_known(f"parameter '{name}'", name, model.name, wanted)
-    for name, given_one in (copied(params) if params else {}).items():
-        wanted[name] = given_one
-    for name, (low, high) in limits.items():
-        one = wanted[name]
-        if one.vary and not math.isfinite(one.max - one.min):
-            if not math.isfinite(high - low):
-                raise InputError(
-                    f"{measurement.name}: '{name}' cannot vary, as the {drive} drive of this test "
-                    "has nothing that would show it; leave it fixed"
-                )
-            one.set(
-                min=one.min if math.isfinite(one.min) else low,
-                max=one.max if math.isfinite(one.max) else high,
-            )
-
+    if params is not None:
+        _put(wanted, params, f"{measurement.name}: ", model.name, drive)
     _counted_from(wanted, measurement.origins, -1.0)
     check_admissible(wanted, usual)
     check_strain(wanted, measurement)
