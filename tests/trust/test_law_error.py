@@ -16,6 +16,7 @@ import records
 from conftest import DATA, correlated, loop_measurement, needs_data
 from foamfit.api import FitResult
 from foamfit.data.measurement import Measurement, Noise, Specimen, Striker
+from foamfit.fitting import search
 from foamfit.fitting.problem import Problem, make_problem
 from foamfit.fitting.search import Tracker
 from foamfit.one_model import Options, identify, judge
@@ -241,7 +242,8 @@ def test_ranges_contain_the_ends_of_hops_that_follow_the_curves_about_as_well():
 
 
 @pytest.mark.parametrize("led", [False, True])
-def test_hops_of_springs_in_series_are_kept_for_their_ranges(led):
+def test_hops_of_springs_in_series_are_kept_for_their_ranges(led, monkeypatch):
+    monkeypatch.setattr(search, "LONG", 20)
     _, best, one = fitted(0)
     assert not one.tracker.met
     given = best.problem.measurement, "bistable+bistable", None, Options(starts=2)
