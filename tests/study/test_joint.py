@@ -1,6 +1,7 @@
 """Joint fits of several tests, from files and a STUDY.toml as a user writes them."""
 
 import json
+import math
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -300,7 +301,7 @@ def test_the_command_writes_and_prints(folder, tmp_path, monkeypatch):
         ('s1_k0 = "share"', "", "s1_k0 = 'share' must be one of shared, own, scatter"),
         ('s1_k0 = "shared"', 'drive = "pull"', "drive = 'pull' must be one of impact"),
         ('s1_k0 = "shared"', "seed = -1", "seed = -1 must be a whole number from 0 up"),
-        ('s1_k0 = "shared"', "sead = 1", "has no key 'sead'; did you mean 'seed' or 'starts'?"),
+        ('s1_k0 = "shared"', "sead = 1", "has no key 'sead'; did you mean 'seed'?"),
         ('s1_k0 = "shared"', 'tests = ["u*.csv"]', "u*.csv: the glob matches no file"),
         ('s1_k0 = "shared"', 'tests = ["t0.csv"]', "a joint fit needs at least two"),
         ('s1_k0 = "shared"', 'model = "microscale+x"', "'x' is not a spring"),
@@ -367,3 +368,19 @@ def test_a_scale_to_first_order_is_said_only_near_one(factor, named):
     result = SimpleNamespace(tests={"a": None, "b": None})
     found = joint_report._scaled(result, SimpleNamespace(point=point))
     assert found == (("a", factor, 0.8) if named else None)
+
+
+@pytest.mark.parametrize(("found", "shown"), [((-2e5, 9e5), (0.0, 9e5)), ((1e5, 9e5), (1e5, 9e5))])
+def test_the_range_of_a_rate_law_ends_at_the_limits_of_its_parameter(monkeypatch, found, shown):
+    """It is the spread between specimens, on either side of the value."""
+    best = SimpleNamespace(
+        problem=SimpleNamespace(free=lambda: ["s1_k0"]), limits=lambda _: (0.0, math.inf)
+    )
+    links = SimpleNamespace(kind=lambda _: "log rate")
+    point = SimpleNamespace(
+        uncertainty=SimpleNamespace(errs=True), bests=[best],
+        found=SimpleNamespace(shared=["s1_k0"], links=links),
+    )  # fmt: skip
+    of_specimens = {"s1_k0": found, "s1_k0:b": (-1.0, 1.0)}
+    monkeypatch.setattr(joint_fit, "_over_specimens", lambda _: of_specimens)
+    assert joint_fit.ranges_of(point) == ({"s1_k0": shown, "s1_k0:b": (-1.0, 1.0)}, [])

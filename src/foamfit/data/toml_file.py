@@ -168,7 +168,7 @@ def check_keys(where: str, given: Iterable[str], valid: Iterable[str]) -> None:
     for key in given:
         if key not in valid:
             key = key[:LONGEST]
-            near = difflib.get_close_matches(key, valid, n=2, cutoff=0.4)
+            near = difflib.get_close_matches(key, valid, n=2)
             meant = f"did you mean {' or '.join(map(repr, near))}?"
             remedy = meant if near else f"its keys are {', '.join(valid)}."
             raise InputError(f"{where} has no key {key!r}; {remedy}")

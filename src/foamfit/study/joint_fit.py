@@ -185,13 +185,15 @@ def ranges_of(point: JointPoint) -> tuple[dict[str, Ends], list[Together]]:
         return {}, refits
     out = _over_specimens(point.found)
     for name in point.found.shared:
+        one = next(best for best in point.bests if name in best.problem.free())
+        ends = [*out.get(name, ())]
         if point.found.links.kind(name) == "shared":
-            one = next(best for best in point.bests if name in best.problem.free())
             held = [fit for sign in (-1.0, 1.0) if (fit := _held(point, name, sign))]
             every = [values[one.index[name]] for fit in held for values in fit.values]
-            ends = [*every, point.found.common[name][0], *out.get(name, ())]
+            ends, refits = [*ends, *every, point.found.common[name][0]], refits + held
+        if ends:
             low, high = np.clip([min(ends), max(ends)], *one.limits(name)).tolist()
-            out[name], refits = (low, high), refits + held
+            out[name] = low, high
     return out, refits
 
 
