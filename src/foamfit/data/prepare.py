@@ -373,7 +373,7 @@ def checks(record: Record, specimen: Specimen, *, several: bool) -> Record:
         notes.append(f"Check: {zeros.UNDER_LOAD}, at {percent(load / peak)} of the peak stress.")
     if first + noise < -_AT_START * peak:
         wrong = f"the stress starts below zero, at {engineering(first, 'Pa')}"
-        notes.append(f"Check: {wrong}; if that is no tension, correct its zero in the file.")
+        notes.append(f"Check: {wrong}; unless it is tension, correct the zero of the force.")
     lowest, width = lowest_mean(stress, int(np.argmax(stress)))
     if lowest < -max(0.002 * peak, 4 * noise_level(stress) / np.sqrt(width)):
         after = f"{engineering(lowest, 'Pa')} after the peak (adhesion, drift or vibration)"

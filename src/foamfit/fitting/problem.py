@@ -366,7 +366,7 @@ def _put(
 ) -> None:
     """Put the user's parameters in place of the usual ones, whose limits stay where none is given.
 
-    Raises InputError for one that does not exist, or that nothing would show.
+    Raises InputError for a parameter that the model does not have or that this test cannot show.
     """
     for name in params:
         _check_known(f"parameter '{name}'", name, model, wanted)
